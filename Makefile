@@ -1,0 +1,46 @@
+# Everything here works on a fresh machine with Python >= 3.11, git, make and an EGL driver.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+SEED ?= 0
+HINDSIGHT ?= halgan
+OUT ?= runs/navigate-$(HINDSIGHT)-seed$(SEED)-$(shell date +%Y%m%d-%H%M%S)
+
+.PHONY: navigate test test-slow check format bench weights clean
+
+navigate: $(VENV)/ready  ## train a navigating agent (make navigate SEED=1 HINDSIGHT=oracle)
+	$(BIN)/python recipes/ddpg_navigate.py --hindsight $(HINDSIGHT) --seed $(SEED) --out $(OUT)
+
+test: $(VENV)/ready check  ## all checks and the test suite, under ten minutes
+	$(BIN)/python -m pytest
+
+test-slow: $(VENV)/ready  ## the tests that train for minutes
+	$(BIN)/python -m pytest -m slow
+
+check: $(VENV)/ready  ## lint, format and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(VENV)/ready
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(VENV)/ready  ## speed, side by side with the stock camera
+	$(BIN)/python benchmarks/env_speed.py
+	$(BIN)/python benchmarks/update_cost.py
+
+weights: $(VENV)/ready  ## train the shipped generators again (about an hour)
+	for environment in navigate-2m navigate-4m; do \
+	  $(BIN)/python recipes/train_halgan.py --environment $$environment --seed 0 --out runs/weights-$$environment && \
+	  for suffix in safetensors json png; do \
+	    cp runs/weights-$$environment/generator.$$suffix halgan_rl/shipped/$$environment.$$suffix; done; done
+
+$(VENV)/ready: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	touch $@
+
+clean:
+	rm -rf $(VENV) build *.egg-info

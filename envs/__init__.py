@@ -1,0 +1,48 @@
+"""Simulated rooms in which a robot looks for its goal; knows no learning.
+
+>>> import envs
+>>> env = envs.make("navigate-2m", seed=0)
+>>> env.reset()["pixels"].shape
+torch.Size([64, 64, 3])
+>>> env.close()
+"""
+
+from typing import Any
+
+from envs import gl_backend  # First: it settles the OpenGL backend, which mujoco and dm_control read once.
+from envs.environment import Environment
+from envs.golden import fingerprint
+from envs.names import NAMES, named
+from envs.navigate import navigate_2m, navigate_4m
+from envs.near_goal import collect_failed, collect_near_goal
+from envs.oracle import GoalRenderer
+from envs.torchrl_env import ComposerEnv
+
+__all__ = [
+    "NAMES",
+    "ComposerEnv",
+    "Environment",
+    "GoalRenderer",
+    "collect_failed",
+    "collect_near_goal",
+    "fingerprint",
+    "gl_backend",
+    "make",
+    "named",
+    "navigate_2m",
+    "navigate_4m",
+]
+
+
+def make(name: str, *, seed: int | None = None, **kwargs: Any) -> ComposerEnv:
+    """Makes a named environment with its TorchRL face.
+
+    Args:
+        name: One of ``NAMES``.
+        seed: Of the starts; equal seeds give equal episodes.
+        kwargs: Further arguments of the environment's function, e.g. ``time_limit`` [s].
+
+    Raises:
+        ValueError: if the name is unknown.
+    """
+    return ComposerEnv(named(name)(random_state=seed, **kwargs))

@@ -1,0 +1,36 @@
+"""Fingerprint of an environment's images: MuJoCo releases and OpenGL drivers change pixels."""
+
+import hashlib
+
+import mujoco
+import numpy as np
+
+from envs.oracle import GoalRenderer
+from envs.rendering import BACKEND
+
+_POSE = np.array([-0.3, -0.2, 0.4])
+_BOX_POSITION = np.array([0.2, 0.1])
+
+
+def fingerprint(name: str) -> dict[str, str]:
+    """What the images of an environment depend on: to stamp into weights and data, and to compare before using them.
+
+    Args:
+        name: One of ``envs.NAMES``.
+
+    Returns:
+        ``environment``: the name; ``mujoco``: its version; ``gl``: the OpenGL backend; ``golden_frame``: the SHA-256 of
+        an image from a fixed pose.
+
+    Raises:
+        ValueError: if the name is unknown.
+    """
+    renderer = GoalRenderer(name)
+    frame = renderer.render(_POSE, _BOX_POSITION)
+    renderer.close()
+    return {
+        "environment": name,
+        "mujoco": mujoco.__version__,
+        "gl": BACKEND,
+        "golden_frame": hashlib.sha256(frame.tobytes()).hexdigest(),
+    }

@@ -1,0 +1,20 @@
+"""The named environments."""
+
+from collections.abc import Callable
+
+from envs.environment import Environment
+from envs.navigate import navigate_2m, navigate_4m
+
+NAMES: dict[str, Callable[..., Environment]] = {"navigate-2m": navigate_2m, "navigate-4m": navigate_4m}
+"""Functions that take ``random_state`` and ``time_limit`` [s] and build an environment."""
+
+
+def named(name: str) -> Callable[..., Environment]:
+    """The function that builds a named environment.
+
+    Raises:
+        ValueError: if the name is unknown.
+    """
+    if name not in NAMES:
+        raise ValueError(f"Unknown environment {name!r}: choose one of {', '.join(sorted(NAMES))}.")
+    return NAMES[name]

@@ -1,0 +1,49 @@
+"""The named environments of the Navigate task: plain functions that put robot, room and task together."""
+
+import numpy as np
+
+from envs.arenas.walled_room import WalledRoom
+from envs.environment import Environment
+from envs.props.goal_box import GoalBox
+from envs.robots.rover import Rover
+from envs.tasks.navigate import Navigate
+
+
+def navigate_4m(random_state: int | np.random.RandomState | None = None, time_limit: float = 20.0) -> Environment:
+    """The paper's room (Sahni et al., NeurIPS 2019): 4 m, start at least 1 m from the box, centre it within 1 cm.
+
+    Args:
+        random_state: Seed or generator of the starts.
+        time_limit: Seconds an episode; a step takes 0.1 s.
+    """
+    # The robot, and what it must find.
+    rover = Rover()
+    goal_box = GoalBox()
+
+    # A room to search.
+    arena = WalledRoom(size=4.0)
+
+    # A task that rewards success only.
+    task = Navigate(rover, arena, goal_box, min_start_distance=1.0, centring_tolerance=0.01)
+
+    return Environment(task, time_limit=time_limit, random_state=random_state)
+
+
+def navigate_2m(random_state: int | np.random.RandomState | None = None, time_limit: float = 20.0) -> Environment:
+    """A room of 2 m and a tolerance of 2 cm: the same task, learned in minutes.
+
+    Args:
+        random_state: Seed or generator of the starts.
+        time_limit: Seconds an episode; a step takes 0.1 s.
+    """
+    # The robot, and what it must find.
+    rover = Rover()
+    goal_box = GoalBox()
+
+    # A room that most of a look takes in.
+    arena = WalledRoom(size=2.0)
+
+    # A task that rewards success only.
+    task = Navigate(rover, arena, goal_box, min_start_distance=1.0, centring_tolerance=0.02)
+
+    return Environment(task, time_limit=time_limit, random_state=random_state)

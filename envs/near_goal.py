@@ -1,0 +1,163 @@
+"""Snapshots near the goal and away from it, for training a hallucinator.
+
+The near-goal ones come from a scripted controller with *privileged* access: it reads the box's position from the
+simulator, which no agent may. It stands in for a person who drives the robot to the goal a few dozen times (Sahni et
+al., NeurIPS 2019, section 4); every episode ends in a real success, and no image is picked by hand.
+"""
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+
+from envs.environment import Environment
+from envs.tasks.navigate import box_in_robot_frame
+
+_CALM_DISTANCE = 0.35
+"""Farther from the box than this [m] the driver wanders little."""
+_FAR_NOISE = 0.2
+"""Share of random actions there."""
+_NOISE = (0.6, 1.0)
+"""Lowest and highest share of random actions near the box: the snippets that hindsight relabels are wandering ones."""
+
+
+class NoisyDriver:
+    """Steers to the box, mixed with uniformly random actions; privileged.
+
+    Each episode draws how noisy it is near the goal, so that its last steps look by turns like a drive and like the
+    wandering of an untrained agent.
+
+    Args:
+        environment: Where it drives.
+        random_state: Source of all its noise.
+        noise: Lowest and highest share of random actions near the goal.
+    """
+
+    def __init__(
+        self, environment: Environment, random_state: np.random.RandomState, noise: tuple[float, float] = _NOISE
+    ) -> None:
+        self._environment = environment
+        self._random_state = random_state
+        self._range = noise
+        self.start_episode()
+
+    def start_episode(self) -> None:
+        """Draws this episode's noise."""
+        self._noise = self._random_state.uniform(*self._range)
+
+    def act(self, pose: np.ndarray) -> np.ndarray:
+        """An action [2] for a robot at pose [3]."""
+        ahead, left = box_in_robot_frame(pose, self._environment.task.goal_box.position(self._environment.physics))
+        noise = self._noise if np.hypot(ahead, left) < _CALM_DISTANCE else _FAR_NOISE
+        if self._random_state.uniform() < noise:
+            return self._random_state.uniform(-1, 1, size=2)
+        return self._steer(ahead, left)
+
+    def _steer(self, ahead: float, left: float) -> np.ndarray:
+        task = self._environment.task
+        bearing = np.arctan2(left, ahead)
+        turn = bearing / (task.rover.max_turn_rate * task.control_timestep)
+        gap = np.hypot(ahead, left) - 0.9 * task.success_distance
+        forward = gap / (task.rover.max_speed * task.control_timestep) if abs(bearing) < 0.5 else 0.0
+        return np.clip([forward, turn], -1.0, 1.0)
+
+
+def collect_near_goal(
+    environment: Environment,
+    count: int,
+    random_state: np.random.RandomState,
+    *,
+    steps_before_goal: int = 32,
+    noise: tuple[float, float] = _NOISE,
+) -> dict[str, np.ndarray]:
+    """Collects the last states of successful rollouts of the privileged driver.
+
+    Args:
+        environment: Where to drive; ends up mid-episode.
+        count: Number of snapshots N.
+        random_state: Source of the driver's noise; the starts are the environment's own.
+        steps_before_goal: States kept of each rollout besides its final one.
+        noise: Lowest and highest share of random actions near the goal.
+
+    Returns:
+        ``pixels`` uint8 [N, H, W, 3], ``pose`` float32 [N, 3], and ``goal_pose`` float32 [N, 3]: the robot's final
+        pose of the same rollout.
+
+    Raises:
+        ValueError: if count or steps_before_goal is out of range.
+        RuntimeError: if the driver hardly ever succeeds.
+    """
+    _check_count(count)
+    if steps_before_goal < 0:
+        raise ValueError(f"steps_before_goal must not be negative; got {steps_before_goal}.")
+    driver = NoisyDriver(environment, random_state, noise)
+    snapshots: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    failures = 0
+    while len(snapshots) < count:
+        tail, succeeded = _drive(environment, driver, steps_before_goal + 1)
+        if succeeded:
+            goal_pose = tail[-1][1]
+            snapshots += [(pixels, pose, goal_pose) for pixels, pose in tail]
+            failures = 0
+        else:
+            failures += 1
+        if failures >= 100:
+            raise RuntimeError("The scripted driver failed 100 times in a row: lower noise or extend the time limit.")
+    kept = snapshots if len(snapshots) == count else [snapshots[i] for i in _subsample(snapshots, count, random_state)]
+    return dict(zip(("pixels", "pose", "goal_pose"), map(np.stack, zip(*kept, strict=True)), strict=True))
+
+
+def collect_failed(environment: Environment, count: int, random_state: np.random.RandomState) -> dict[str, np.ndarray]:
+    """Collects snapshots of episodes with uniformly random actions that do not succeed.
+
+    The box may be in view: nobody looks.
+
+    Args:
+        environment: Where to wander; ends up mid-episode.
+        count: Number of snapshots M.
+        random_state: Source of the actions; the starts are the environment's own.
+
+    Returns:
+        ``pixels`` uint8 [M, H, W, 3] and ``pose`` float32 [M, 3].
+
+    Raises:
+        ValueError: if count is out of range.
+    """
+    _check_count(count)
+    snapshots: list[tuple[np.ndarray, np.ndarray]] = []
+    while len(snapshots) < count:
+        episode, succeeded = _wander(environment, random_state)
+        snapshots += [] if succeeded else episode
+    return dict(zip(("pixels", "pose"), map(np.stack, zip(*snapshots[:count], strict=True)), strict=True))
+
+
+def _drive(environment: Environment, driver: NoisyDriver, keep: int) -> tuple[list[Any], bool]:
+    driver.start_episode()
+    timestep = environment.reset()
+    tail = deque([_snapshot(timestep)], maxlen=keep)
+    while not timestep.last():
+        timestep = environment.step(driver.act(tail[-1][1]))
+        tail.append(_snapshot(timestep))
+    return list(tail), timestep.discount == 0.0
+
+
+def _wander(environment: Environment, random_state: np.random.RandomState) -> tuple[list[Any], bool]:
+    timestep = environment.reset()
+    episode = [_snapshot(timestep)]
+    while not timestep.last():
+        timestep = environment.step(random_state.uniform(-1, 1, size=2))
+        episode.append(_snapshot(timestep))
+    return episode, timestep.discount == 0.0
+
+
+def _snapshot(timestep: Any) -> tuple[np.ndarray, np.ndarray]:
+    return timestep.observation["rover/pixels"], timestep.observation["rover/pose"]
+
+
+def _subsample(snapshots: list[Any], count: int, random_state: np.random.RandomState) -> np.ndarray:
+    return np.sort(random_state.choice(len(snapshots), size=count, replace=False))
+
+
+def _check_count(count: int) -> None:
+    if count <= 0:
+        raise ValueError(f"count must be positive; got {count}.")

@@ -1,0 +1,56 @@
+"""GoalBox: the red cube that the robot must find."""
+
+from typing import Any
+
+import numpy as np
+from dm_control import composer, mjcf
+
+from envs.contact import CONTACT
+
+
+class GoalBox(composer.Entity):
+    """A coloured cube that stands on the floor and cannot be pushed: a mocap body, moved through physics only.
+
+    Args:
+        size: Edge length [m].
+        rgba: Colour.
+        name: Name of the entity.
+
+    Raises:
+        ValueError: if the size is not positive.
+    """
+
+    def _build(
+        self, size: float = 0.08, rgba: tuple[float, ...] = (0.85, 0.08, 0.06, 1.0), name: str = "goal_box"
+    ) -> None:
+        if size <= 0:
+            raise ValueError(f"size must be positive; got {size} m.")
+        self.size = size
+        self._mjcf_root = mjcf.RootElement(model=name)
+        self._mjcf_root.worldbody.add(
+            "geom", name="cube", type="box", size=[size / 2] * 3, pos=[0, 0, size / 2], rgba=rgba,
+            **CONTACT,
+        )  # fmt: skip
+
+    @property
+    def mjcf_model(self) -> mjcf.RootElement:
+        """The box's MJCF."""
+        return self._mjcf_root
+
+    @property
+    def radius(self) -> float:
+        """Of the circle around its footprint [m]."""
+        return float(self.size / np.sqrt(2))
+
+    def after_compile(self, physics: Any, random_state: np.random.RandomState) -> None:
+        """Finds the box's address in the compiled model."""
+        del random_state
+        self._mocap = int(physics.model.ptr.body(self._mjcf_root.full_identifier).mocapid[0])
+
+    def position(self, physics: Any) -> np.ndarray:
+        """Of its centre: x, y [m], float64 [2], in the world frame."""
+        return physics.data.ptr.mocap_pos[self._mocap, :2].copy()
+
+    def set_position(self, physics: Any, position: np.ndarray) -> None:
+        """Moves the box to x, y [m]; positions derived from it are stale until a forward."""
+        physics.data.ptr.mocap_pos[self._mocap, :2] = position

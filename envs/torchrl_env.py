@@ -1,0 +1,111 @@
+"""ComposerEnv: the TorchRL face of an environment."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from envs.environment import Environment
+from envs.rendering import PersistentCamera
+
+_OVERSHOOT = 1e-3
+"""Actions this little out of range are clipped (rounding); larger ones are errors."""
+
+
+class ComposerEnv(EnvBase):
+    """A composer environment as a TorchRL environment.
+
+    Reads ``action`` float32 [2]; writes ``pixels`` uint8 [64, 64, 3], ``pose`` float32 [3] (x [m], y [m], yaw [rad]),
+    ``reward`` float32 [1], and ``done``, ``terminated``, ``truncated`` bool [1]. Success terminates; the time limit
+    truncates. Pickle a factory such as ``functools.partial(envs.make, "navigate-2m")``, not the environment: an
+    OpenGL context lives in one process and, with EGL, on one thread.
+
+    Args:
+        environment: The environment, owned and closed by this one.
+    """
+
+    def __init__(self, environment: Environment) -> None:
+        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([]))
+        self.environment = environment
+        self.rover = environment.task.rover
+        self._overview: PersistentCamera | None = None
+        self._make_specs()
+
+    def _make_specs(self) -> None:
+        height, width = self.rover.image_size
+        self.observation_spec = Composite(
+            pixels=Bounded(0, 255, shape=(height, width, 3), dtype=torch.uint8),
+            pose=Unbounded(shape=(3,), dtype=torch.float32),
+        )
+        self.action_spec = Bounded(-1.0, 1.0, shape=(2,), dtype=torch.float32)
+        self.reward_spec = Unbounded(shape=(1,), dtype=torch.float32)
+        self.done_spec = Composite(
+            done=Binary(1, shape=(1,), dtype=torch.bool),
+            terminated=Binary(1, shape=(1,), dtype=torch.bool),
+            truncated=Binary(1, shape=(1,), dtype=torch.bool),
+        )
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        del tensordict, kwargs
+        return self._pack(self.environment.reset().observation, terminated=False, truncated=False)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        timestep = self.environment.step(checked_action(tensordict["action"].numpy()))
+        if timestep.first():
+            raise RuntimeError("The episode is over: call reset before the next step.")
+        terminated = timestep.last() and timestep.discount == 0.0
+        out = self._pack(timestep.observation, terminated, truncated=timestep.last() and not terminated)
+        out.set("reward", torch.tensor([timestep.reward], dtype=torch.float32))
+        return out
+
+    def _pack(self, observation: dict[str, np.ndarray], terminated: bool, truncated: bool) -> TensorDict:
+        source = {
+            "pixels": torch.from_numpy(observation["rover/pixels"]),
+            "pose": torch.from_numpy(observation["rover/pose"]),
+            "done": torch.tensor([terminated or truncated]),
+            "terminated": torch.tensor([terminated]),
+            "truncated": torch.tensor([truncated]),
+        }
+        return TensorDict._new_unsafe(source, batch_size=self.batch_size, device=self.device)
+
+    def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
+        # TorchRL would check shapes and complete the done flags here; _pack leaves nothing to complete.
+        return next_tensordict_out
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.environment.random_state.seed(seed)
+
+    def render_overview(self, height: int = 240, width: int = 320) -> np.ndarray:
+        """Renders the room from outside, for people: uint8 [height, width, 3], anti-aliased."""
+        if self._overview is None or self._overview.shape != (height, width):
+            self._close_overview()
+            self._overview = PersistentCamera(
+                self.environment.physics, "overview", height=height, width=width, samples=4
+            )
+        return self._overview.render(self.environment.physics)
+
+    def _close_overview(self) -> None:
+        if self._overview is not None:
+            self._overview.close()
+        self._overview = None
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Frees cameras and physics."""
+        super().close(raise_if_closed=raise_if_closed)
+        self._close_overview()
+        self.environment.close()
+
+
+def checked_action(action: np.ndarray) -> np.ndarray:
+    """An action [2] clipped to [-1, 1].
+
+    Raises:
+        ValueError: if an entry is not a number, or out of range by more than rounding.
+    """
+    # Written so that NaN fails too.
+    if not abs(action).max() <= 1 + _OVERSHOOT:
+        raise ValueError(f"Actions must lie in [-1, 1]; got {action.tolist()}: squash or clamp the policy's output.")
+    return np.clip(action, -1.0, 1.0)

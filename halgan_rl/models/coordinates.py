@@ -1,0 +1,77 @@
+"""A generator that paints by coordinates: cheap, and exact under shifts of the goal across the image."""
+
+import torch
+from torch import Tensor, nn
+
+from halgan_rl.models.halgan import LEAK, HallucinationGenerator
+
+SIZE = 64
+
+
+class CoordinateGenerator(HallucinationGenerator):
+    """Decides for each pixel, from its coordinates alone, whether the goal covers it and in which colour.
+
+    A small network turns relative pose and latent into a set of half-planes of the image, the first layer of a
+    pixel-wise network: affine maps of (u, v), which place, scale and turn whatever the shared layers behind them
+    draw. Moving the goal is then a change of a few numbers and not, as in a stack of convolutions, a picture to be
+    learned for each place; bearing comes out right from the start, and an image costs about a fifth of the paper's.
+
+    The output is a matte, ``[N, 4, 64, 64]``: three channels of colour in [-1, 1] and an opacity in [0, 1].
+
+    Args:
+        feature_size: K, entries of the configuration's features.
+        latent_size: Z; the latent is drawn from N(0, 1).
+        width: channels of each pixel-wise layer.
+        depth: pixel-wise layers behind the first.
+        opacity: mean opacity before training; small, so that training starts near the identity.
+    """
+
+    def __init__(
+        self, feature_size: int = 4, latent_size: int = 8, width: int = 32, depth: int = 2, opacity: float = 0.05
+    ) -> None:
+        super().__init__()
+        self.arguments = {
+            "feature_size": feature_size,
+            "latent_size": latent_size,
+            "width": width,
+            "depth": depth,
+            "opacity": opacity,
+        }
+        self.latent_size = latent_size
+        self.register_buffer("mean", torch.zeros(feature_size))
+        self.register_buffer("scale", torch.ones(feature_size))
+        self.place = nn.Sequential(
+            nn.Linear(feature_size + latent_size, 64),
+            nn.LeakyReLU(LEAK),
+            nn.Linear(64, 64),
+            nn.LeakyReLU(LEAK),
+            nn.Linear(64, 3 * width),
+        )
+        layers: list[nn.Module] = []
+        for _ in range(depth):
+            layers += [nn.Linear(width, width), nn.LeakyReLU(LEAK)]
+        self.paint = nn.Sequential(*layers, nn.Linear(width, 4))
+        with torch.no_grad():
+            self.place[-1].bias[: 2 * width].normal_(0, 1.5)
+            self.paint[-1].bias[3] = torch.logit(torch.tensor(opacity))
+        axis = (torch.arange(SIZE) + 0.5) / (SIZE / 2) - 1
+        v, u = torch.meshgrid(axis, axis, indexing="ij")
+        self.register_buffer("pixels", torch.stack([u, v, torch.ones_like(u)], -1).reshape(-1, 3), persistent=False)
+
+    def forward(self, features: Tensor, latent: Tensor) -> Tensor:
+        """Return the matte ``[N, 4, 64, 64]``, in channels_last."""
+        condition = torch.cat([(features - self.mean) / self.scale, latent], -1)
+        planes = self.place(condition).unflatten(-1, (3, -1))
+        hidden = nn.functional.leaky_relu(self.pixels @ planes, LEAK)
+        colour, opacity = self.paint(hidden).split([3, 1], -1)
+        matte = torch.cat([colour.tanh(), opacity.sigmoid()], -1)
+        return matte.unflatten(1, (SIZE, SIZE)).permute(0, 3, 1, 2)
+
+    def sample_latent(self, count: int, rng: torch.Generator) -> Tensor:
+        """Draw latents ``[count, Z]`` from N(0, 1)."""
+        return torch.randn(count, self.latent_size, generator=rng)
+
+    def compose(self, images: Tensor, change: Tensor) -> Tensor:
+        """Lay the matte over images; exactly the identity where the opacity is 0."""
+        colour, opacity = change.split([3, 1], 1)
+        return images + opacity * (colour - images)

@@ -1,0 +1,57 @@
+"""Pictures of a run: learning curves, the agent at work, hallucinations beside the truth."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+from matplotlib.figure import Figure
+from torch import Tensor
+
+Curve = Mapping[str, Sequence[float]]
+
+
+def draw_learning_curves(
+    path: Path, curves: Mapping[str, Curve], *, title: str, column: str = "eval/success_rate"
+) -> None:
+    """Draw one column of several runs' metrics over frames.
+
+    Args:
+        path: the PNG to write.
+        curves: for each label, the columns of a ``metrics.csv``; ``frames`` and ``column`` are drawn.
+        title: heading of the picture.
+        column: a rate in [0, 1].
+    """
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axes = figure.subplots()
+    for label, curve in curves.items():
+        axes.plot(curve["frames"], curve[column], marker=".", label=label)
+    axes.set(title=title, xlabel="environment frames", ylabel=column, ylim=(-0.03, 1.03))
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.savefig(path, dpi=120)
+
+
+def draw_frame_grid(path: Path, rows: Mapping[str, Tensor], *, title: str) -> None:
+    """Draw labelled rows of frames.
+
+    Args:
+        path: the PNG to write.
+        rows: for each label, frames ``[N, H, W, 3]`` uint8; all rows have the same N.
+        title: heading of the picture.
+    """
+    columns = len(next(iter(rows.values())))
+    figure = Figure(figsize=(1.1 * columns + 1.2, 1.2 * len(rows) + 0.4), layout="constrained")
+    figure.suptitle(title, fontsize=10)
+    grid = figure.subplots(len(rows), columns, squeeze=False)
+    for axes_row, (label, frames) in zip(grid, rows.items(), strict=True):
+        axes_row[0].set_ylabel(label, rotation=0, ha="right", va="center", fontsize=9)
+        for axes, frame in zip(axes_row, frames, strict=True):
+            axes.imshow(frame.numpy(), interpolation="nearest")
+            axes.set(xticks=[], yticks=[])
+    figure.savefig(path, dpi=120)
+
+
+def write_gif(path: Path, frames: Sequence[np.ndarray], *, frames_per_second: float = 20.0) -> None:
+    """Write frames ``[H, W, 3]`` uint8 as an endlessly looping GIF."""
+    iio.imwrite(path, np.stack(list(frames)), extension=".gif", duration=1000.0 / frames_per_second, loop=0)

@@ -1,0 +1,9 @@
+"""Hindsight as TorchRL replay transforms: small, single-purpose, composed with :class:`torchrl.envs.Compose`."""
+
+from halgan_rl.transforms.base import ReplayTransform
+from halgan_rl.transforms.draw_hindsight_goal import DrawHindsightGoal
+from halgan_rl.transforms.hallucinate_goal import HallucinateGoal
+from halgan_rl.transforms.hindsight_reward import HindsightReward
+from halgan_rl.transforms.stamp_future_poses import StampFuturePoses
+
+__all__ = ["DrawHindsightGoal", "HallucinateGoal", "HindsightReward", "ReplayTransform", "StampFuturePoses"]

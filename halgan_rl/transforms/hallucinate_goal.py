@@ -1,0 +1,117 @@
+"""The second step of the sample path: painting the goal into the images."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from torch import Tensor
+
+from halgan_rl.transforms.base import ReplayTransform, next_key
+
+if TYPE_CHECKING:
+    from halgan_rl.hallucinators import Hallucinator
+
+
+class HallucinateGoal(ReplayTransform):
+    """Edits the images of relabelled rows so that the goal is seen in them.
+
+    **Core rule.** Where ``(goal, "mask")`` is True, the images at t and t+1 are replaced by what the hallucinator makes
+    of them, seen from the poses at t and t+1, with the one goal pose; both in one call, so that they show one and the
+    same goal. Other rows stay as they are, bit for bit.
+
+    Hallucination is costly, so only masked rows are gathered and edited. ``fixed_shape=True`` edits all rows and
+    selects by the mask, for CUDA graphs and ``torch.compile``. Both give equal results if a row's hallucination depends
+    on that row only; one that draws latents draws others for other batch sizes.
+
+    The hallucinator is no submodule: its weights stay out of ``state_dict()`` and its train or eval mode is its own.
+
+    Args:
+        hallucinator: Maps pixels uint8 ``[N, 2, H, W, 3]``, pose ``[N, 2, P]`` and goal pose ``[N, 1, P]`` to pixels.
+
+    Keyword Args:
+        pixels_key: Images uint8 ``[H, W, 3]``, at the root and under ``"next"``.
+        pose_key: Poses ``[P]``, at the root and under ``"next"``.
+        goal_key: Where :class:`~halgan_rl.transforms.DrawHindsightGoal` wrote ``"mask"`` and ``"pose"``.
+        fixed_shape: Whether to hallucinate all rows, so that no shape depends on the data.
+
+    Raises:
+        TypeError: If the hallucinator is not callable.
+        ValueError: On sampling, if the hallucinator returns another shape or dtype than it was given.
+        KeyError: On sampling, if a row lacks a key; names the key and the argument that set it.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> black = torch.zeros(2, 4, 4, 3, dtype=torch.uint8)
+        >>> frame = TensorDict({"pixels": black, "pose": torch.zeros(2, 3)}, batch_size=[2])
+        >>> goal = {"mask": torch.tensor([[True], [False]]), "pose": torch.ones(2, 3)}
+        >>> rows = frame.clone().update({"next": frame, "goal": goal})
+        >>> rows = HallucinateGoal(lambda pixels, pose, goal_pose: pixels + 9)(rows)
+        >>> rows["next", "pixels"].amax((1, 2, 3)).tolist()
+        [9, 0]
+    """
+
+    hallucinator: Hallucinator
+
+    def __init__(
+        self,
+        hallucinator: Hallucinator,
+        *,
+        pixels_key: NestedKey = "pixels",
+        pose_key: NestedKey = "pose",
+        goal_key: NestedKey = "goal",
+        fixed_shape: bool = False,
+    ) -> None:
+        super().__init__()
+        if not callable(hallucinator):
+            raise TypeError(f"hallucinator must be callable on (pixels, pose, goal_pose), got {hallucinator!r}.")
+        self.__dict__["hallucinator"] = hallucinator  # past nn.Module, which would register it
+        self.pixels_key = pixels_key
+        self.pose_key = pose_key
+        self.goal_key = goal_key
+        self.fixed_shape = fixed_shape
+
+    def _edit_rows(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Paints the goal into the images of relabelled rows ``[...]``."""
+        mask = self._read(tensordict, unravel_key((self.goal_key, "mask")), "goal_key")
+        goal_pose = self._read(tensordict, unravel_key((self.goal_key, "pose")), "goal_key")
+        pose = self._read_both(tensordict, self.pose_key, "pose_key")
+        pixels = self._read_both(tensordict, self.pixels_key, "pixels_key")
+        edit = self._edit_all if self.fixed_shape else self._edit_masked
+        rows = (entry.reshape(-1, *entry.shape[tensordict.batch_dims :]) for entry in (*pixels, *pose, goal_pose))
+        edited = edit(mask.flatten(), *rows)
+        for key, before, after in zip((self.pixels_key, next_key(self.pixels_key)), pixels, edited, strict=True):
+            tensordict.set(key, after.reshape(before.shape))
+        return tensordict
+
+    def _read_both(self, tensordict: TensorDictBase, key: NestedKey, argument: str) -> tuple[Tensor, Tensor]:
+        """Returns an entry at t and at t+1."""
+        return self._read(tensordict, key, argument), self._read(tensordict, next_key(key), argument)
+
+    def _edit_masked(self, mask: Tensor, pixels: Tensor, next_pixels: Tensor, *poses: Tensor) -> tuple[Tensor, Tensor]:
+        """Hallucinates the masked ones of N rows only."""
+        index = mask.nonzero().squeeze(-1)
+        if len(index) == 0:
+            return pixels, next_pixels
+        root, following = self._hallucinate(*(entry[index] for entry in (pixels, next_pixels, *poses)))
+        return pixels.index_copy(0, index, root), next_pixels.index_copy(0, index, following)
+
+    def _edit_all(self, mask: Tensor, pixels: Tensor, next_pixels: Tensor, *poses: Tensor) -> tuple[Tensor, Tensor]:
+        """Hallucinates all of N rows, then keeps the masked ones: the same shapes whatever the mask."""
+        root, following = self._hallucinate(pixels, next_pixels, *poses)
+        mask = mask[:, None, None, None]
+        return torch.where(mask, root, pixels), torch.where(mask, following, next_pixels)
+
+    def _hallucinate(
+        self, pixels: Tensor, next_pixels: Tensor, pose: Tensor, next_pose: Tensor, goal_pose: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Calls the hallucinator on both frames of each of N rows at once."""
+        frames = torch.stack([pixels, next_pixels], dim=1)
+        edited = self.hallucinator(frames, torch.stack([pose, next_pose], dim=1), goal_pose.unsqueeze(1))
+        if edited.shape != frames.shape or edited.dtype != frames.dtype:
+            raise ValueError(
+                f"The hallucinator {self.hallucinator!r} must return pixels like those it was given, "
+                f"{frames.dtype} {tuple(frames.shape)}, but returned {edited.dtype} {tuple(edited.shape)}."
+            )
+        return edited[:, 0], edited[:, 1]

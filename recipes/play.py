@@ -1,0 +1,60 @@
+"""Play a saved policy and report its success rate.
+
+Usage::
+
+    python recipes/play.py --run runs/ddpg_navigate                  # 100 starts that training never evaluated on
+    python recipes/play.py --run runs/ddpg_navigate --gif agent.gif  # and film the first five
+"""
+
+import dataclasses
+from functools import partial
+from pathlib import Path
+
+import tyro
+from tensordict.nn import TensorDictModule
+
+import envs
+from halgan_rl import pictures
+from halgan_rl.evaluation import evaluate, record
+from halgan_rl.models.agents import Actor
+from halgan_rl.weights import load_module
+
+FIRST_SEED = 20_000
+"""Seed of the first start; the starts of training's own evaluations lie below."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Play a saved policy and report its success rate."""
+
+    run: Path
+    """Folder of a run, which holds `policy.safetensors`."""
+    starts: int = 100
+    """Episodes to play, each from a start of its own."""
+    first_seed: int = FIRST_SEED
+    """Seed of the first start."""
+    gif: Path | None = None
+    """Film the first five episodes into this file."""
+
+
+def main(config: Config) -> None:
+    """Evaluate the policy of a run, and film it if asked to."""
+    path = config.run / "policy.safetensors"
+    network, manifest = load_module(path, Actor)
+    policy = TensorDictModule(network, in_keys=["pixels"], out_keys=["action"])
+    env = envs.make(manifest["environment"])
+    seeds = range(config.first_seed, config.first_seed + config.starts)
+    result = evaluate(env, policy, seeds=seeds)
+    print(
+        f"{path} in {manifest['environment']}: success rate {result.success_rate:.1%} over {config.starts} starts, "
+        f"mean return {result.episode_return:.3f}, mean episode {result.episode_length:.1f} steps"
+    )
+    if config.gif is not None:
+        film = record(env, policy, partial(env.render_overview, 256, 320), seeds=seeds[:5])
+        pictures.write_gif(config.gif, film)
+        print(f"film: {config.gif}")
+    env.close()
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config, description=__doc__))
