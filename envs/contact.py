@@ -9,6 +9,6 @@ CONTACT: dict[str, Any] = {
 }
 """MJCF attributes of every geom that collides; without friction, or a touch would spin the robot.
 
-``solref`` in MuJoCo's direct form, stiffness [1/s^2] and damping [1/s]: at substeps of 0.02 s an impact stops within one
-substep, and what it sank in (at most 1 cm at 0.5 m/s) shrinks by 40 % a substep. Larger numbers bounce.
+``solref`` in MuJoCo's direct form, stiffness [1/s^2] and damping [1/s]: at substeps of 0.02 s an impact stops within
+one substep, and what it sank in (at most 1 cm at 0.5 m/s) shrinks by 40 % a substep. Larger numbers bounce.
 """

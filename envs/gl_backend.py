@@ -1,9 +1,10 @@
 """Chooses the OpenGL backend that MuJoCo renders with.
 
-Importing this module settles ``MUJOCO_GL``. It must come before mujoco and dm_control, which read the variable once, on
-import; so it imports neither.
+Importing this module settles ``MUJOCO_GL``, then imports mujoco and dm_control's renderer, which read it once. Whoever
+imports those two themselves should import this first.
 """
 
+import importlib
 import os
 import subprocess
 import sys
@@ -99,4 +100,14 @@ def _checked(preset: str) -> str:
     return preset
 
 
+def _load() -> None:
+    # A backend whose library is missing fails here, with errors that name neither it nor the remedy.
+    try:
+        importlib.import_module("mujoco")
+        importlib.import_module("dm_control._render")
+    except Exception as error:
+        raise RuntimeError(broken(error)) from error
+
+
 choose()
+_load()

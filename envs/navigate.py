@@ -9,15 +9,18 @@ from envs.robots.rover import Rover
 from envs.tasks.navigate import Navigate
 
 
-def navigate_4m(random_state: int | np.random.RandomState | None = None, time_limit: float = 20.0) -> Environment:
+def navigate_4m(
+    random_state: int | np.random.RandomState | None = None, time_limit: float = 20.0, reverse_speed: float = 0.0
+) -> Environment:
     """The paper's room (Sahni et al., NeurIPS 2019): 4 m, start at least 1 m from the box, centre it within 1 cm.
 
     Args:
         random_state: Seed or generator of the starts.
         time_limit: Seconds an episode; a step takes 0.1 s.
+        reverse_speed: Of the robot at forward action -1 [m/s]; 0: it has no reverse gear.
     """
     # The robot, and what it must find.
-    rover = Rover()
+    rover = Rover(reverse_speed=reverse_speed)
     goal_box = GoalBox()
 
     # A room to search.
@@ -29,15 +32,18 @@ def navigate_4m(random_state: int | np.random.RandomState | None = None, time_li
     return Environment(task, time_limit=time_limit, random_state=random_state)
 
 
-def navigate_2m(random_state: int | np.random.RandomState | None = None, time_limit: float = 20.0) -> Environment:
+def navigate_2m(
+    random_state: int | np.random.RandomState | None = None, time_limit: float = 20.0, reverse_speed: float = 0.0
+) -> Environment:
     """A room of 2 m and a tolerance of 2 cm: the same task, learned in minutes.
 
     Args:
         random_state: Seed or generator of the starts.
         time_limit: Seconds an episode; a step takes 0.1 s.
+        reverse_speed: Of the robot at forward action -1 [m/s]; 0: it has no reverse gear.
     """
     # The robot, and what it must find.
-    rover = Rover()
+    rover = Rover(reverse_speed=reverse_speed)
     goal_box = GoalBox()
 
     # A room that most of a look takes in.

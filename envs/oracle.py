@@ -45,7 +45,12 @@ class GoalRenderer:
 
         Returns:
             uint8, of the shape and on the device of ``pixels``.
+
+        Raises:
+            ValueError: if a pose is not finite or has fewer than three entries.
         """
+        if min(pose.shape[-1], goal_pose.shape[-1]) < 3:
+            raise ValueError(f"Poses start with x, y, yaw; these have sizes {pose.shape[-1]}, {goal_pose.shape[-1]}.")
         leading = pixels.shape[:-3]
         poses = pose[..., :3].expand(*leading, 3).reshape(-1, 3).double().cpu().numpy()
         goals = goal_pose[..., :3].expand(*leading, 3).reshape(-1, 3).double().cpu().numpy()

@@ -4,14 +4,10 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from dm_control import _render
+from dm_control.mujoco.wrapper import MjrContext
 
 from envs import gl_backend
-
-try:
-    from dm_control import _render
-    from dm_control.mujoco.wrapper import MjrContext
-except (ImportError, AttributeError) as error:  # MUJOCO_GL names a backend whose library is missing.
-    raise RuntimeError(gl_backend.broken(error)) from error
 
 BACKEND: str = _render.BACKEND
 """The OpenGL backend in use, as dm_control names it."""
@@ -111,4 +107,7 @@ def _make_context(model: Any, gl: Any, height: int, width: int, samples: int, sh
     visual.global_.offheight, visual.global_.offwidth = height, width
     visual.quality.offsamples = samples
     visual.quality.shadowsize = 2048 if shadows else 0
-    return MjrContext(model, gl)
+    try:
+        return MjrContext(model, gl)
+    except mujoco.FatalError as error:
+        raise RuntimeError(gl_backend.broken(error)) from error

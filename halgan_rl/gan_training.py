@@ -74,7 +74,12 @@ class HalganTrainer:
         failed_pixels: Tensor,
         settings: GanSettings,
         rng: torch.Generator,
+        calibrate: bool = False,
+        regressor: Discriminator | None = None,
     ) -> None:
+        self.regressor = regressor
+        self._expect = nn.Sequential(nn.Linear(4, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, 4)) if calibrate else None
+        if calibrate: self._expect_opt = torch.optim.Adam(self._expect.parameters(), lr=1e-3)
         self.generator, self.discriminator, self.settings, self.rng = generator, discriminator, settings, rng
         self._real_pixels, self._failed_pixels = near_goal["pixels"], failed_pixels
         self._labels = goal_labels(settings.configuration, near_goal["pose"], near_goal["goal_pose"])
@@ -87,6 +92,8 @@ class HalganTrainer:
         self._discriminator_optimizer = torch.optim.Adam(
             discriminator.parameters(), lr=settings.discriminator_rate, betas=settings.betas
         )
+        if regressor is not None:
+            self._regressor_optimizer = torch.optim.Adam(regressor.parameters(), lr=1e-3)
         self._average = AveragedModel(
             generator, multi_avg_fn=get_ema_multi_avg_fn(settings.average_decay), use_buffers=True
         )
@@ -132,13 +139,17 @@ class HalganTrainer:
     # --- steps
     def warm_up(self) -> float:
         images, features = self._draw_real()
-        loss = nn.functional.mse_loss(self.discriminator(images)[1], features)
-        self._descend(self._discriminator_optimizer, loss)
+        net, opt = (self.regressor, self._regressor_optimizer) if self.regressor is not None else (self.discriminator, self._discriminator_optimizer)
+        guess = net(images)[1]
+        loss = nn.functional.mse_loss(guess, features)
+        if self._expect is not None: self._descend(self._expect_opt, nn.functional.mse_loss(self._expect(features), guess.detach()))
+        self._descend(opt, loss)
         return loss.item()
 
     def step(self) -> dict[str, Tensor]:
         metrics = {}
         for _ in range(self.settings.critic_steps):
+            if self.regressor is not None: self.warm_up()
             metrics |= self._train_discriminator()
         metrics |= self._train_generator()
         self._average.update_parameters(self.generator)
@@ -148,29 +159,32 @@ class HalganTrainer:
         s = self.settings
         real, features = self._draw_real()
         with torch.no_grad():
-            _, _, fake = self._draw_fake()
-        score, guess = self.discriminator(real)
-        fake_score, _ = self.discriminator(fake)
+            _, fake_features, fake = self._draw_fake()
+        score, guess = self.discriminator(real, features)
+        fake_score, _ = self.discriminator(fake, fake_features)
         distance = score.mean() - fake_score.mean()
         auxiliary = nn.functional.mse_loss(guess, features)
         loss = -distance + s.auxiliary_weight * auxiliary
         if self._critic_step % s.penalty_interval == 0:
-            loss = loss + s.penalty_interval * s.penalty_weight * self._gradient_penalty(real, fake)
+            loss = loss + s.penalty_interval * s.penalty_weight * self._gradient_penalty(real, fake, features, fake_features)
         self._critic_step += 1
         self._descend(self._discriminator_optimizer, loss)
         return {"distance": distance.detach(), "auxiliary_real": auxiliary.detach()}
 
-    def _gradient_penalty(self, real: Tensor, fake: Tensor) -> Tensor:
+    def _gradient_penalty(self, real: Tensor, fake: Tensor, a: Tensor, b: Tensor) -> Tensor:
         mix = torch.rand(len(real), 1, 1, 1, generator=self.rng)
         between = torch.lerp(real, fake, mix).requires_grad_()
-        score, _ = self.discriminator(between)
+        score, _ = self.discriminator(between, torch.lerp(a, b, mix[:, :, 0, 0]))
         (gradient,) = torch.autograd.grad(score.sum(), between, create_graph=True)
         return (gradient.flatten(1).norm(dim=1) - 1).square().mean()
 
     def _train_generator(self) -> dict[str, Tensor]:
         s = self.settings
         images, features, fake = self._draw_fake()
-        score, guess = self.discriminator(fake)
+        score, guess = self.discriminator(fake, features)
+        if self.regressor is not None: guess = self.regressor(fake)[1]
+        if self._expect is not None:
+            with torch.no_grad(): features = self._expect(features)
         auxiliary = nn.functional.mse_loss(guess, features)
         change = (fake - images).square().mean()
         loss = -score.mean() + s.auxiliary_weight * auxiliary + s.change_weight * change

@@ -46,6 +46,7 @@ from typing import Literal
 
 import torch
 import tyro
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -96,6 +97,8 @@ class Config:
     """Who paints the goal into failed transitions: the GAN, the simulator itself, or nobody."""
     weights: Path | None = None
     """Generator to hallucinate with; by default the one shipped for the environment."""
+    allow_other_mujoco: bool = False
+    """Accept weights trained with another release of MuJoCo, whose images may differ."""
     seed: int = 0
     """Seed of everything random in the run."""
     total_frames: int = 30_000
@@ -155,6 +158,21 @@ class Config:
     evaluation_starts: int = 50
     """Fixed starts of an evaluation."""
 
+    def __post_init__(self) -> None:
+        """Refuse values that would fail only later."""
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if type(field.default) is int and field.name != "seed" and value < 1:
+                raise ValueError(f"{field.name} must be at least 1, got {value}")
+        for name in ("hallucination_start", "hallucination_end", "epsilon_start", "epsilon_end"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} is a share: it must lie in [0, 1], got {getattr(self, name)}")
+        if self.warmup_frames < self.max_distance:
+            raise ValueError(
+                f"warmup_frames={self.warmup_frames} is below max_distance={self.max_distance}: rows wait that long for "
+                "their future before they can be sampled; warm up longer"
+            )
+
 
 PRESETS = {
     "default": Config(),
@@ -192,7 +210,9 @@ def make_hallucinator(config: Config) -> Hallucinator | None:
     if config.hindsight == "oracle":
         return GoalRenderer(config.environment)
     path = config.weights or shipped_weights(config.environment)
-    generator = load_generator(path, expected=envs.fingerprint(config.environment))
+    generator = load_generator(
+        path, expected=envs.fingerprint(config.environment), allow_other_mujoco=config.allow_other_mujoco
+    )
     return GanHallucinator(generator, rng=torch.Generator().manual_seed(config.seed))
 
 
@@ -212,8 +232,18 @@ def make_hindsight(config: Config, hallucinator: Hallucinator | None) -> Compose
     )
 
 
-def make_loss(config: Config, actor: TensorDictModule, critic: TensorDictModule) -> DDPGLoss:
-    """Return TorchRL's DDPG loss with the targets that the configuration asks for."""
+def make_agent(config: Config, *, action_size: int) -> tuple[TensorDictModule, TensorDictModule]:
+    """Return actor and critic; both read the camera image alone."""
+    actor = Actor(action_size, downsample=config.downsample)
+    critic = Critic(action_size, downsample=config.downsample)
+    return (
+        TensorDictModule(actor, in_keys=["pixels"], out_keys=["action"]),
+        TensorDictModule(critic, in_keys=["pixels", "action"], out_keys=["state_action_value"]),
+    )
+
+
+def make_loss(config: Config, actor: TensorDictModule, critic: TensorDictModule) -> tuple[DDPGLoss, SoftUpdate]:
+    """Return TorchRL's DDPG loss, with the targets that the configuration asks for, and its target networks' updater."""
     loss = DDPGLoss(actor, critic, delay_actor=True, delay_value=True)
     if config.clip_targets:
         estimator = ClippedTD0Estimator(low=-1.0, high=1.0, gamma=config.discount, value_network=loss.actor_critic)
@@ -221,7 +251,32 @@ def make_loss(config: Config, actor: TensorDictModule, critic: TensorDictModule)
         loss.make_value_estimator(estimator)
     else:
         loss.make_value_estimator(ValueEstimators.TD0, gamma=config.discount)
-    return loss
+    return loss, SoftUpdate(loss, tau=config.target_rate)
+
+
+def make_optimizer(config: Config, loss: DDPGLoss) -> torch.optim.Optimizer:
+    """Return one Adam for both networks, with a learning rate for each."""
+    actor_parameters = list(loss.actor_network_params.values(True, True))
+    critic_parameters = list(loss.value_network_params.values(True, True))
+    return torch.optim.Adam(
+        [
+            {"params": actor_parameters, "lr": config.actor_learning_rate},
+            {"params": critic_parameters, "lr": config.critic_learning_rate},
+        ],
+        fused=True,
+    )
+
+
+def update(
+    batch: TensorDictBase, loss: DDPGLoss, optimizer: torch.optim.Optimizer, target_updater: SoftUpdate
+) -> TensorDictBase:
+    """Make one DDPG update; return the losses."""
+    losses = loss(batch)
+    (losses["loss_actor"] + losses["loss_value"]).backward()  # TorchRL detaches the critic inside the actor's loss
+    optimizer.step()
+    optimizer.zero_grad()
+    target_updater.step()
+    return losses
 
 
 class Means:
@@ -255,12 +310,9 @@ def main(config: Config) -> None:
     evaluation_env = envs.make(config.environment)
     starts = range(EVALUATION_SEED, EVALUATION_SEED + config.evaluation_starts)
 
-    # The agent: both networks read the camera image alone.
+    # The agent, and how it explores.
     action_spec = env.action_spec
-    actor_network = Actor(action_spec.shape[-1], downsample=config.downsample)
-    critic_network = Critic(action_spec.shape[-1], downsample=config.downsample)
-    actor = TensorDictModule(actor_network, in_keys=["pixels"], out_keys=["action"])
-    critic = TensorDictModule(critic_network, in_keys=["pixels", "action"], out_keys=["state_action_value"])
+    actor, critic = make_agent(config, action_size=action_spec.shape[-1])
     noise = AdditiveGaussianModule(action_spec, sigma_init=config.noise, sigma_end=config.noise)
     epsilon = EGreedyModule(action_spec, config.epsilon_start, config.epsilon_end, config.epsilon_frames)
     explorer = TensorDictSequential(actor, noise, epsilon)
@@ -284,16 +336,8 @@ def main(config: Config) -> None:
     )
 
     # Learning.
-    loss = make_loss(config, actor, critic)
-    target_updater = SoftUpdate(loss, tau=config.target_rate)
-    optimizer = torch.optim.Adam(
-        [
-            {"params": list(loss.actor_network_params.values(True, True)), "lr": config.actor_learning_rate},
-            {"params": list(loss.value_network_params.values(True, True)), "lr": config.critic_learning_rate},
-        ],
-        fused=True,
-    )
-
+    loss, target_updater = make_loss(config, actor, critic)
+    optimizer = make_optimizer(config, loss)
     means = Means()
     frames, updates, next_evaluation = 0, 0, config.evaluate_every
     evaluation_success = float("nan")
@@ -309,11 +353,7 @@ def main(config: Config) -> None:
 
         while frames > config.warmup_frames and updates < (frames - config.warmup_frames) // config.frames_per_update:
             batch = buffer.sample()
-            losses = loss(batch)
-            (losses["loss_actor"] + losses["loss_value"]).backward()
-            optimizer.step()
-            optimizer.zero_grad()
-            target_updater.step()
+            losses = update(batch, loss, optimizer, target_updater)
             updates += 1
             means.add(
                 hallucinated=batch["goal", "mask"].float().mean() if hindsight is not None else torch.zeros(()),
@@ -338,7 +378,7 @@ def main(config: Config) -> None:
                 "train/epsilon": float(epsilon.eps),
             }
             folder.write_metrics(metrics)
-            save_policy(folder, config, actor_network)
+            save_policy(folder, config, actor.module)
             for name, value in metrics.items():
                 if logger is not None:
                     logger.log_scalar(name, value, step=frames)

@@ -46,7 +46,7 @@ def _cell(ahead: Tensor, left: Tensor) -> Tensor:
 class Parking(EnvBase):
     """The environment; ``count`` cars at once give batch size [count], None gives []."""
 
-    def __init__(self, count: int | None = None, *, seed: int = 0, time_limit: int = 18, distance: int = 5) -> None:
+    def __init__(self, count: int | None = None, *, seed: int = 0, time_limit: int = 18, distance: int = 6) -> None:
         super().__init__(batch_size=[] if count is None else [count])
         shape = self.batch_size
         self.time_limit = time_limit

@@ -28,7 +28,8 @@ class Rover(composer.Entity):
         body_height: Height of the body [m]; the mast on it rises to the camera.
         mass: [kg].
         max_speed: Forward speed at action +1 [m/s].
-        min_speed: Forward speed at action -1 [m/s], negative for reverse; ``-max_speed`` by default.
+        reverse_speed: Backward speed at action -1 [m/s]. By default 0, no reverse gear: a robot that sees only what is
+            ahead would back through goals that hindsight puts behind it. Action 0 is rest either way.
         max_turn_rate: Turn rate at action +1, to the left [rad/s].
         camera_height: [m].
         camera_pitch: How far the camera looks down [rad].
@@ -46,7 +47,7 @@ class Rover(composer.Entity):
         body_height: float = 0.045,
         mass: float = 1.0,
         max_speed: float = 0.5,
-        min_speed: float | None = None,
+        reverse_speed: float = 0.0,
         max_turn_rate: float = np.deg2rad(100.0),
         camera_height: float = 0.1,
         camera_pitch: float = np.deg2rad(15.0),
@@ -56,12 +57,12 @@ class Rover(composer.Entity):
     ) -> None:
         self.radius = radius
         self.max_speed = max_speed
-        self.min_speed = -max_speed if min_speed is None else min_speed
+        self.reverse_speed = reverse_speed
         self.max_turn_rate = max_turn_rate
         self.image_size = image_size
         self.camera: PersistentCamera | None = None
         self._mjcf_root = mjcf.RootElement(model=name)
-        _check_speeds(self.min_speed, max_speed, max_turn_rate)
+        _check_speeds(reverse_speed, max_speed, max_turn_rate)
         _check_view(radius, camera_height - body_height, camera_pitch + field_of_view / 2)
         self._build_body(radius, body_height, mass)
         self._build_camera(camera_height, camera_pitch, field_of_view)
@@ -141,9 +142,9 @@ class Rover(composer.Entity):
         self.camera = None
 
     def apply_action(self, physics: Any, action: np.ndarray, random_state: np.random.RandomState) -> None:
-        """Sets the servos: action -1 ... +1 is ``min_speed`` ... ``max_speed``, and right ... left."""
+        """Sets the servos: action -1 ... 0 ... +1 is backward, rest, forward, and right, none, left."""
         del random_state
-        speed = self.min_speed + (float(action[0]) + 1) / 2 * (self.max_speed - self.min_speed)
+        speed = float(action[0]) * (self.max_speed if action[0] > 0 else self.reverse_speed)
         physics.data.ptr.ctrl[self._ctrl] = speed, 0.0, float(action[1]) * self.max_turn_rate
 
     def pose(self, physics: Any) -> np.ndarray:
@@ -190,9 +191,9 @@ def _first_and_end(physics: Any, prefix: str) -> tuple[int, int]:
     return first, first + 3
 
 
-def _check_speeds(min_speed: float, max_speed: float, max_turn_rate: float) -> None:
-    if not min_speed < max_speed or max_speed <= 0:
-        raise ValueError(f"Need min_speed < max_speed and max_speed > 0; got {min_speed} and {max_speed} m/s.")
+def _check_speeds(reverse_speed: float, max_speed: float, max_turn_rate: float) -> None:
+    if reverse_speed < 0 or max_speed <= 0:
+        raise ValueError(f"Need max_speed > 0 and reverse_speed >= 0; got {max_speed} and {reverse_speed} m/s.")
     if max_turn_rate <= 0:
         raise ValueError(f"max_turn_rate must be positive; got {max_turn_rate} rad/s.")
 

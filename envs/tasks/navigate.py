@@ -74,14 +74,14 @@ class Navigate(composer.Task):
 
     def _check_lengths(self) -> None:
         nearest = self.rover.radius + self.goal_box.size / 2
-        if self.success_distance <= nearest:
+        if not self.success_distance > nearest:
             raise ValueError(
-                f"success_distance={self.success_distance} m cannot be reached: robot and box touch at {nearest:.3f} m; "
-                "use a larger one."
+                f"success_distance={self.success_distance} m cannot be reached: robot and box touch at "
+                f"{nearest:.3f} m; use a larger one."
             )
-        if self.centring_tolerance <= 0:
+        if not self.centring_tolerance > 0:
             raise ValueError(f"centring_tolerance must be positive; got {self.centring_tolerance} m.")
-        if self.min_start_distance <= self.success_distance:
+        if not self.min_start_distance > self.success_distance:
             raise ValueError(
                 f"min_start_distance={self.min_start_distance} m must exceed "
                 f"success_distance={self.success_distance} m, or episodes start solved."

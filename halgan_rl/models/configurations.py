@@ -3,63 +3,82 @@
 from typing import Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from halgan_rl.poses import relative_pose
 
 Configuration = Literal["polar", "planar"]
 
-LABEL_SIZE: dict[Configuration, int] = {"polar": 2, "planar": 3}
-FEATURE_SIZE: dict[Configuration, int] = {"polar": 2, "planar": 4}
 
-
-def goal_labels(kind: Configuration, pose: Tensor, goal_pose: Tensor) -> Tensor:
-    """Describe where the goal pose lies as seen from a pose.
+class GoalEncoding(nn.Module):
+    """Describes where the goal pose lies as seen from a pose: labels for people, features for networks.
 
     - ``"polar"``, the paper's (appendix): distance [m] and bearing [rad] to the goal position; where the positions
-      coincide, the bearing is the difference of the yaws.
-    - ``"planar"``: the whole relative pose: x ahead [m], y left [m], yaw difference [rad].
+      coincide, the bearing is the difference of the yaws. The features are the labels.
+    - ``"planar"``: the whole relative pose: x ahead [m], y left [m], yaw difference [rad]. The features have sine and
+      cosine of the yaw: an object that the goal pose faces lies at a *linear* function of them in the frame of the pose.
 
-    Flags of the task, the entries of a pose after the third, follow unchanged.
+    Flags of the task, the entries of a pose after the third, follow in both.
 
     Args:
         kind: which description.
-        pose: ``[..., P]`` world frame, P >= 3.
-        goal_pose: ``[..., P]`` world frame, broadcast against ``pose``.
+        pose_size: P, entries of a pose.
 
-    Returns:
-        ``[..., L + P - 3]``, L being ``LABEL_SIZE[kind]``.
+    Raises:
+        ValueError: if the kind is unknown or a pose has fewer than three entries.
     """
-    relative = relative_pose(pose, goal_pose)
-    if kind == "polar":
-        x, y, yaw = relative.unbind(-1)
-        distance = torch.hypot(x, y)
-        relative = torch.stack([distance, torch.where(distance < 1e-4, yaw, torch.atan2(y, x))], -1)
-    flags = pose[..., 3:].expand(*relative.shape[:-1], -1)
-    return torch.cat([relative, flags], -1)
 
+    mean: Tensor
+    scale: Tensor
 
-def label_features(kind: Configuration, labels: Tensor) -> Tensor:
-    """Turn labels into the networks' inputs: a yaw becomes its sine and cosine.
+    def __init__(self, kind: Configuration = "planar", pose_size: int = 3) -> None:
+        super().__init__()
+        if kind not in ("polar", "planar"):
+            raise ValueError(f"configuration={kind!r} is unknown: choose 'polar' or 'planar'")
+        if pose_size < 3:
+            raise ValueError(f"pose_size={pose_size} is too small: a pose has at least x, y and yaw")
+        self.kind = kind
+        self.lengths = 1 if kind == "polar" else 2
+        self.size = self.lengths + (1 if kind == "polar" else 2) + pose_size - 3
+        self.register_buffer("mean", torch.zeros(self.size))
+        self.register_buffer("scale", torch.ones(self.size))
 
-    With them the object that the goal pose faces, a fixed distance ahead of it, lies at a *linear* function of the
-    features in the frame of the pose.
+    def labels(self, pose: Tensor, goal_pose: Tensor) -> Tensor:
+        """Describe goal poses ``[..., P]`` as seen from poses ``[..., P]``, both in the world frame; broadcasts.
 
-    Args:
-        kind: as in :func:`goal_labels`.
-        labels: ``[..., L + flags]``.
+        Returns:
+            ``[..., L]``: lengths, then one angle, then flags.
+        """
+        relative = relative_pose(pose, goal_pose)
+        if self.kind == "polar":
+            x, y, yaw = relative.unbind(-1)
+            distance = torch.hypot(x, y)
+            relative = torch.stack([distance, torch.where(distance < 1e-4, yaw, torch.atan2(y, x))], -1)
+        return torch.cat([relative, pose[..., 3:].expand(*relative.shape[:-1], -1)], -1)
 
-    Returns:
-        ``[..., FEATURE_SIZE[kind] + flags]``.
-    """
-    if kind == "polar":
-        return labels
-    yaw = labels[..., 2:3]
-    return torch.cat([labels[..., :2], yaw.sin(), yaw.cos(), labels[..., 3:]], -1)
+    def forward(self, labels: Tensor) -> Tensor:
+        """Return standardised features ``[..., K]`` of labels ``[..., L]``."""
+        return (self._features(labels) - self.mean) / self.scale
 
+    def standardise(self, labels: Tensor) -> None:
+        """Set mean and scale so that the features of these labels ``[N, L]`` have mean 0 and variance 1."""
+        features = self._features(labels)
+        self.mean.copy_(features.mean(0))
+        self.scale.copy_(features.std(0).clamp_min(1e-3))
 
-def mirrored(kind: Configuration, labels: Tensor) -> Tensor:
-    """Return the labels of the left-right mirrored images: angles and the sideways offset change sign."""
-    signs = torch.ones_like(labels)
-    signs[..., 1 : LABEL_SIZE[kind]] = -1
-    return labels * signs
+    def mirror(self, labels: Tensor) -> Tensor:
+        """Return the labels ``[..., L]`` of images that are mirrored left to right."""
+        signs = torch.ones(labels.shape[-1], device=labels.device)
+        signs[1 : self.lengths + 1] = -1
+        return labels * signs
+
+    def noise(self, length: float, angle: float) -> Tensor:
+        """Return standard deviations ``[L]``: of lengths [m], of the angle [rad], and 0 for flags."""
+        flags = self.size - self.lengths - (1 if self.kind == "polar" else 2)
+        return torch.tensor([length] * self.lengths + [angle] + [0.0] * flags)
+
+    def _features(self, labels: Tensor) -> Tensor:
+        if self.kind == "polar":
+            return labels
+        yaw = labels[..., 2:3]
+        return torch.cat([labels[..., :2], yaw.sin(), yaw.cos(), labels[..., 3:]], -1)

@@ -1,8 +1,11 @@
 """A generator that paints by coordinates: cheap, and exact under shifts of the goal across the image."""
 
+import math
+
 import torch
 from torch import Tensor, nn
 
+from halgan_rl.models.configurations import Configuration
 from halgan_rl.models.halgan import LEAK, HallucinationGenerator
 
 SIZE = 64
@@ -19,50 +22,51 @@ class CoordinateGenerator(HallucinationGenerator):
     The output is a matte, ``[N, 4, 64, 64]``: three channels of colour in [-1, 1] and an opacity in [0, 1].
 
     Args:
-        feature_size: K, entries of the configuration's features.
-        latent_size: Z; the latent is drawn from N(0, 1).
+        configuration: how the network is told the relative pose.
+        pose_size: P, entries of a pose.
+        latent_size: Z; the latent is drawn from N(0, 1). What it has to tell is little: which way the goal is turned.
         width: channels of each pixel-wise layer.
         depth: pixel-wise layers behind the first.
         opacity: mean opacity before training; small, so that training starts near the identity.
+        gain: factor on the half-planes' slopes; large, so that edges become sharp soon.
     """
 
+    pixels: Tensor
+
     def __init__(
-        self, feature_size: int = 4, latent_size: int = 8, width: int = 32, depth: int = 2, opacity: float = 0.05
+        self,
+        configuration: Configuration = "planar",
+        pose_size: int = 3,
+        latent_size: int = 2,
+        *,
+        width: int = 32,
+        depth: int = 2,
+        opacity: float = 0.05,
+        gain: float = 4.0,
     ) -> None:
-        super().__init__()
-        self.arguments = {
-            "feature_size": feature_size,
-            "latent_size": latent_size,
-            "width": width,
-            "depth": depth,
-            "opacity": opacity,
-        }
-        self.latent_size = latent_size
-        self.register_buffer("mean", torch.zeros(feature_size))
-        self.register_buffer("scale", torch.ones(feature_size))
+        super().__init__(configuration, pose_size, latent_size)
+        self.arguments |= {"width": width, "depth": depth, "opacity": opacity, "gain": gain}
+        self.gain = gain
+        last = nn.Linear(64, 3 * width)
         self.place = nn.Sequential(
-            nn.Linear(feature_size + latent_size, 64),
-            nn.LeakyReLU(LEAK),
-            nn.Linear(64, 64),
-            nn.LeakyReLU(LEAK),
-            nn.Linear(64, 3 * width),
+            nn.Linear(self.encoding.size + latent_size, 64), nn.LeakyReLU(LEAK), nn.Linear(64, 64), nn.LeakyReLU(LEAK), last
         )
         layers: list[nn.Module] = []
         for _ in range(depth):
-            layers += [nn.Linear(width, width), nn.LeakyReLU(LEAK)]
-        self.paint = nn.Sequential(*layers, nn.Linear(width, 4))
+            layers += [nn.Linear(width, width), nn.LeakyReLU(LEAK, inplace=True)]
+        matte = nn.Linear(width, 4)
+        self.paint = nn.Sequential(*layers, matte)
         with torch.no_grad():
-            self.place[-1].bias[: 2 * width].normal_(0, 1.5)
-            self.paint[-1].bias[3] = torch.logit(torch.tensor(opacity))
+            last.bias[: 2 * width].normal_(0, 1.5)
+            matte.bias[3] = math.log(opacity / (1 - opacity))
         axis = (torch.arange(SIZE) + 0.5) / (SIZE / 2) - 1
         v, u = torch.meshgrid(axis, axis, indexing="ij")
         self.register_buffer("pixels", torch.stack([u, v, torch.ones_like(u)], -1).reshape(-1, 3), persistent=False)
 
     def forward(self, features: Tensor, latent: Tensor) -> Tensor:
         """Return the matte ``[N, 4, 64, 64]``, in channels_last."""
-        condition = torch.cat([(features - self.mean) / self.scale, latent], -1)
-        planes = self.place(condition).unflatten(-1, (3, -1))
-        hidden = nn.functional.leaky_relu(self.pixels @ planes, LEAK)
+        planes = self.place(torch.cat([features, latent], -1)).unflatten(-1, (3, -1)) * self.gain
+        hidden = nn.functional.leaky_relu_(self.pixels @ planes, LEAK)
         colour, opacity = self.paint(hidden).split([3, 1], -1)
         matte = torch.cat([colour.tanh(), opacity.sigmoid()], -1)
         return matte.unflatten(1, (SIZE, SIZE)).permute(0, 3, 1, 2)

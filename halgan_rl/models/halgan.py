@@ -6,6 +6,8 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from halgan_rl.models.configurations import Configuration, GoalEncoding
+
 LEAK = 0.3  # the slope of Keras' LeakyReLU, which the authors use
 
 
@@ -14,11 +16,25 @@ class HallucinationGenerator(nn.Module, ABC):
 
     Its output depends on the relative pose and a latent alone, never on the image.
 
+    Args:
+        configuration: how the network is told the relative pose.
+        pose_size: P, entries of a pose.
+        latent_size: Z.
+
     Attributes:
-        arguments: what rebuilds the network, ready for JSON.
+        arguments: what rebuilds the network, ready for JSON; subclasses add their own.
+        encoding: turns poses into the network's features.
     """
 
-    arguments: dict[str, int | float | str]
+    def __init__(self, configuration: Configuration, pose_size: int, latent_size: int) -> None:
+        super().__init__()
+        self.arguments: dict[str, int | float | str] = {
+            "configuration": configuration,
+            "pose_size": pose_size,
+            "latent_size": latent_size,
+        }
+        self.encoding = GoalEncoding(configuration, pose_size)
+        self.latent_size = latent_size
 
     @abstractmethod
     def forward(self, features: Tensor, latent: Tensor) -> Tensor:
@@ -40,7 +56,8 @@ class PaperGenerator(HallucinationGenerator):
     configuration, counting BatchNorm's running statistics.
 
     Args:
-        feature_size: K, entries of the configuration's features.
+        configuration: how the network is told the relative pose.
+        pose_size: P, entries of a pose.
         latent_size: Z.
         composition: ``"dimming"`` is the paper's tanh(s + H), which shrinks the contrast of the whole image even where
             H = 0; ``"difference"`` is s + tanh(s + H) - tanh(s), the identity there.
@@ -48,15 +65,15 @@ class PaperGenerator(HallucinationGenerator):
 
     def __init__(
         self,
-        feature_size: int = 2,
+        configuration: Configuration = "polar",
+        pose_size: int = 3,
         latent_size: int = 128,
         composition: Literal["dimming", "difference"] = "dimming",
     ) -> None:
-        super().__init__()
-        self.arguments = {"feature_size": feature_size, "latent_size": latent_size, "composition": composition}
-        self.latent_size = latent_size
+        super().__init__(configuration, pose_size, latent_size)
+        self.arguments["composition"] = composition
         self.composition = composition
-        self.embedding = nn.Linear(feature_size, latent_size)
+        self.embedding = nn.Linear(self.encoding.size, latent_size)
         layers: list[nn.Module] = []
         widths = [latent_size, 64, 64, 64, 32, 32, 16]
         for inputs, outputs in zip(widths, widths[1:], strict=False):
@@ -90,7 +107,7 @@ class Discriminator(nn.Module):
         first_stride: 1 as in the paper; 2 costs about a quarter of the arithmetic, with the same parameters.
     """
 
-    def __init__(self, feature_size: int = 2, first_stride: Literal[1, 2] = 1) -> None:
+    def __init__(self, feature_size: int = 2, first_stride: Literal[1, 2] = 1, conditional: bool = False) -> None:
         super().__init__()
         strides = [first_stride, 2, 2, 2, 2, 2, 2 if first_stride == 1 else 1]
         widths = [3, 32, 32, 32, 64, 64, 64, 128]
@@ -100,16 +117,20 @@ class Discriminator(nn.Module):
         self.layers = nn.Sequential(*layers, nn.Flatten())
         self.realism = nn.Linear(128, 1)
         self.configuration = nn.Linear(128, feature_size)
+        self.projection = nn.Linear(feature_size, 128) if conditional else None
         self.to(memory_format=torch.channels_last)
 
-    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, images: Tensor, features: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Judge images ``[N, 3, 64, 64]`` in [-1, 1].
 
         Returns:
             The critic's score ``[N]`` and the regressed features ``[N, K]``.
         """
         hidden = self.layers(images)
-        return self.realism(hidden).squeeze(-1), self.configuration(hidden)
+        score = self.realism(hidden).squeeze(-1)
+        if self.projection is not None and features is not None:
+            score = score + (self.projection(features) * hidden).sum(-1)
+        return score, self.configuration(hidden)
 
 
 def _same_convolution(inputs: int, outputs: int, stride: int = 1) -> list[nn.Module]:

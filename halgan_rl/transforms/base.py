@@ -41,12 +41,17 @@ class ReplayTransform(Transform):
         """Returns the entry at ``key``; ``argument`` is the constructor argument that chose it."""
         value = tensordict.get(key, None)
         if value is None:
+            present = ", ".join(sorted(map(dotted, tensordict.keys(True, True))))
             raise KeyError(
-                f"{type(self).__name__}: the key {key!r}, set by the constructor argument "
-                f"{argument}={getattr(self, argument)!r}, is not among the row's keys "
-                f"{sorted(map(str, tensordict.keys(True, True)))}."
+                f"{type(self).__name__} misses the key {dotted(key)}, set by the constructor argument "
+                f"{argument}={getattr(self, argument)!r}. The rows hold {present}."
             )
         return value
+
+
+def dotted(key: NestedKey) -> str:
+    """Writes a key for people: ``next.pose``."""
+    return key if isinstance(key, str) else ".".join(key)
 
 
 def next_key(key: NestedKey) -> NestedKey:

@@ -1,0 +1,125 @@
+"""Steps and frames a second of the environment, beside dm_control's stock camera in the same scene.
+
+Usage: python benchmarks/env_speed.py [--name navigate-2m] [--steps 500] [--rounds 5]
+
+Every measurement runs in a process of its own (OpenGL contexts of different kinds do not mix), the variants by turns,
+so that what else the machine does falls on all of them. The table shows medians, by wall time and by processor time,
+which a busy machine distorts less; the ratios are of processor time.
+"""
+
+import argparse
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+import envs
+from envs.environment import Environment
+
+
+def bare_renderer(name: str, steps: int) -> Callable[[], None]:
+    """The camera alone: no step of any environment can be faster."""
+    environment = envs.named(name)(random_state=0)
+    environment.reset()
+    return lambda: repeat(steps, lambda: environment.task.rover.camera.render(environment.physics))
+
+
+def composer(name: str, steps: int) -> Callable[[], None]:
+    """Our composer environment with random actions, resets included."""
+    return stepping(envs.named(name)(random_state=0), steps)
+
+
+def torchrl_face(name: str, steps: int) -> Callable[[], None]:
+    """The TorchRL environment: a rollout with TorchRL's random actions, resets included."""
+    env = envs.make(name, seed=0)
+    return lambda: env.rollout(steps, break_when_any_done=False)
+
+
+def stock_camera(name: str, steps: int) -> Callable[[], None]:
+    """The same task and scene with dm_control's own camera observable."""
+    from dm_control.composer.observation import observable
+
+    environment = envs.named(name)(random_state=0)
+    rover = environment.task.rover
+    stock = observable.MJCFCamera(rover.mjcf_model.find("camera", "egocentric"), height=64, width=64)
+    stock.enabled = True
+    rover.observables.add_observable("stock", stock)
+    rover.observables.pixels.enabled = False
+    return stepping(Environment(environment.task, time_limit=20.0, random_state=0), steps)
+
+
+VARIANTS = {
+    "bare renderer": bare_renderer,
+    "ours, composer": composer,
+    "ours, TorchRL": torchrl_face,
+    "stock composer camera": stock_camera,
+}
+
+
+def stepping(environment: Environment, steps: int) -> Callable[[], None]:
+    """A run of random steps; composer resets by itself after an episode."""
+    actions = np.random.RandomState(0).uniform(-1, 1, size=(steps, 2))
+    return lambda: [environment.step(action) for action in actions][:0]
+
+
+def repeat(times: int, what: Callable[[], object]) -> None:
+    """Calls something again and again."""
+    for _ in range(times):
+        what()
+
+
+def measure(variant: str, name: str, steps: int) -> tuple[float, float]:
+    """Steps a second of one variant, of wall time and of processor time, after a warm-up of the same length."""
+    torch.set_num_threads(1)
+    run = VARIANTS[variant](name, steps)
+    run()
+    wall, processor = time.perf_counter(), time.process_time()
+    run()
+    return steps / (time.perf_counter() - wall), steps / (time.process_time() - processor)
+
+
+def measure_elsewhere(variant: str, name: str, steps: int) -> tuple[float, float]:
+    """The same in a process of its own."""
+    command = [sys.executable, __file__, "--name", name, "--steps", str(steps), "--variant", variant]
+    output = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+    wall, processor = output.split()[-2:]
+    return float(wall), float(processor)
+
+
+def main() -> None:
+    """Reads the command line and prints a table, or one number for ``--variant``."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--name", default="navigate-2m", choices=sorted(envs.NAMES), help="which environment")
+    parser.add_argument("--steps", default=500, type=int, help="steps a measurement")
+    parser.add_argument("--rounds", default=5, type=int, help="measurements a variant")
+    parser.add_argument("--variant", choices=list(VARIANTS), help="measure only this one, here, and print its number")
+    flags = parser.parse_args()
+    if flags.variant:
+        print(*measure(flags.variant, flags.name, flags.steps))
+        return
+    results: dict[str, list[tuple[float, float]]] = {variant: [] for variant in VARIANTS}
+    for _ in range(flags.rounds):
+        for variant, values in results.items():
+            values.append(measure_elsewhere(variant, flags.name, flags.steps))
+    print_table(flags.name, results)
+
+
+def print_table(name: str, results: dict[str, list[tuple[float, float]]]) -> None:
+    """Medians, spread, and the ratio to the stock camera."""
+    wall = {variant: [value[0] for value in values] for variant, values in results.items()}
+    processor = {variant: statistics.median(value[1] for value in values) for variant, values in results.items()}
+    print(f"{name}, 64x64 pixels, {envs.gl_backend.VARIABLE}={envs.fingerprint(name)['gl']}, one process\n")
+    print("| variant | steps/s | lowest to highest | steps per processor second | ratio to stock |")
+    print("|---|---|---|---|---|")
+    for variant, values in wall.items():
+        ratio = processor[variant] / processor["stock composer camera"]
+        spread = f"{min(values):,.0f} to {max(values):,.0f}"
+        print(f"| {variant} | {statistics.median(values):,.0f} | {spread} | {processor[variant]:,.0f} | {ratio:.1f} |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+"""Hallucinators: whatever paints a goal into images."""
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from halgan_rl.models.halgan import HallucinationGenerator
+from halgan_rl.models.pixels import to_float, to_uint8
+
+
+class Hallucinator(Protocol):
+    """Paints the goal into images as it would be seen from their poses."""
+
+    def __call__(self, pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
+        """Paint one goal into the F images of each of N rows.
+
+        Args:
+            pixels: uint8 ``[N, F, H, W, 3]``; not modified.
+            pose: float ``[N, F, P]``, from where each image was taken.
+            goal_pose: float ``[N, 1, P]``, from where the goal is reached.
+
+        Returns:
+            uint8, of the shape and on the device of ``pixels``.
+        """
+
+
+class GanHallucinator:
+    """Paints goals with a trained generator.
+
+    The images of one row share one latent, so that they show one and the same goal. A plain object, no module: the
+    network's weights stay out of whoever holds it.
+
+    Args:
+        generator: the trained network; its train or eval mode is left as it was found.
+        rng: draws the latents.
+        chunk: images of one pass; few keep the activations of a pass in a CPU's cache.
+
+    Raises:
+        ValueError: if poses have another size than those that the network was trained with, or are not finite.
+    """
+
+    def __init__(self, generator: HallucinationGenerator, *, rng: torch.Generator, chunk: int = 4) -> None:
+        self._generator, self._rng, self._chunk = generator, rng, chunk
+
+    @torch.no_grad()
+    def __call__(self, pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
+        """Paint the goals, see :class:`Hallucinator`."""
+        self._check(pose, goal_pose)
+        rows, frames = pixels.shape[:2]
+        features = self._generator.encoding(self._generator.encoding.labels(pose, goal_pose)).flatten(0, 1)
+        latent = self._generator.sample_latent(rows, self._rng).repeat_interleave(frames, 0)
+        was_training = self._generator.training
+        self._generator.eval()
+        parts = zip(*(part.split(self._chunk) for part in (pixels.flatten(0, 1), features, latent)), strict=True)
+        painted = [self._paint(*part) for part in parts]
+        self._generator.train(was_training)
+        return torch.cat(painted).reshape(pixels.shape) if painted else pixels.clone()
+
+    def _paint(self, pixels: Tensor, features: Tensor, latent: Tensor) -> Tensor:
+        return to_uint8(self._generator.compose(to_float(pixels), self._generator(features, latent)))
+
+    def _check(self, pose: Tensor, goal_pose: Tensor) -> None:
+        size = self._generator.arguments["pose_size"]
+        for name, value in (("pose", pose), ("goal_pose", goal_pose)):
+            if value.shape[-1] != size:
+                raise ValueError(
+                    f"{name} has {value.shape[-1]} entries, but the generator was trained with {size}: "
+                    "use weights of an environment with such poses"
+                )
+            if not value.isfinite().all():
+                raise ValueError(f"{name} holds NaN or infinity: look for it in the rows of the replay buffer")

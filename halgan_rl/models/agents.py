@@ -1,0 +1,112 @@
+"""The agents' networks of the paper (Sahni et al., NeurIPS 2019, appendix), all on the camera image alone."""
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from halgan_rl.models.halgan import LEAK
+from halgan_rl.models.pixels import to_float
+
+Downsample = Literal["stride", "max_pool"]
+
+_VISION_SIZE = 512
+_HIDDEN_SIZE = 32
+
+
+class Vision(nn.Module):
+    """Four 5x5 convolutions of 4, 8, 16 and 32 channels, each of which halves the image. 17,160 parameters.
+
+    Args:
+        downsample: how each convolution halves: ``"stride"`` 2, or ``"max_pool"`` behind it. The paper's table does not
+            tell; the parameters are the same, the strides cost about a third of the time.
+
+    Raises:
+        ValueError: if ``downsample`` is neither.
+    """
+
+    def __init__(self, downsample: Downsample = "stride") -> None:
+        super().__init__()
+        if downsample not in ("stride", "max_pool"):
+            raise ValueError(f"downsample={downsample!r} is unknown: choose 'stride' or 'max_pool'")
+        pooled = downsample == "max_pool"
+        layers: list[nn.Module] = []
+        for inputs, outputs in ((3, 4), (4, 8), (8, 16), (16, 32)):
+            layers += [nn.Conv2d(inputs, outputs, 5, stride=1 if pooled else 2, padding=2), nn.LeakyReLU(LEAK)]
+            layers += [nn.MaxPool2d(2)] if pooled else []
+        self.layers = nn.Sequential(*layers, nn.Flatten())
+        self.to(memory_format=torch.channels_last)
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """Return features ``[N, 512]`` of images uint8 ``[..., 64, 64, 3]``, N the product of the leading dimensions.
+
+        Raises:
+            ValueError: if the images have another shape or type.
+        """
+        if pixels.shape[-3:] != (64, 64, 3) or pixels.dtype != torch.uint8:
+            raise ValueError(f"pixels must be uint8 [..., 64, 64, 3], got {pixels.dtype} {list(pixels.shape)}")
+        return self.layers(to_float(pixels))
+
+
+class Actor(nn.Module):
+    """The deterministic policy of DDPG: 33,642 parameters for 2 actions.
+
+    Args:
+        action_size: A.
+        downsample: see :class:`Vision`.
+
+    Examples:
+        >>> Actor()(torch.zeros(5, 1, 64, 64, 3, dtype=torch.uint8)).shape
+        torch.Size([5, 1, 2])
+    """
+
+    def __init__(self, action_size: int = 2, *, downsample: Downsample = "stride") -> None:
+        super().__init__()
+        self.action_size = action_size
+        self.vision = Vision(downsample)
+        self.head = _head(_VISION_SIZE, action_size)
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """Return actions ``[..., A]`` in [-1, 1] for images uint8 ``[..., 64, 64, 3]``."""
+        return self.head(self.vision(pixels)).tanh().reshape(*pixels.shape[:-3], -1)
+
+
+class Critic(nn.Module):
+    """The value of an action in DDPG; the action joins the flattened features. 33,673 parameters for 2 actions.
+
+    Args:
+        action_size: A.
+        downsample: see :class:`Vision`.
+    """
+
+    def __init__(self, action_size: int = 2, *, downsample: Downsample = "stride") -> None:
+        super().__init__()
+        self.vision = Vision(downsample)
+        self.head = _head(_VISION_SIZE + action_size, 1)
+
+    def forward(self, pixels: Tensor, action: Tensor) -> Tensor:
+        """Return values ``[..., 1]`` for images uint8 ``[..., 64, 64, 3]`` and actions ``[..., A]``."""
+        joined = torch.cat([self.vision(pixels), action.reshape(-1, action.shape[-1])], -1)
+        return self.head(joined).reshape(*pixels.shape[:-3], 1)
+
+
+class QNetwork(nn.Module):
+    """The action values of DDQN: 33,708 parameters for 4 actions.
+
+    Args:
+        actions: number of discrete actions A.
+        downsample: see :class:`Vision`.
+    """
+
+    def __init__(self, actions: int = 4, *, downsample: Downsample = "stride") -> None:
+        super().__init__()
+        self.vision = Vision(downsample)
+        self.head = _head(_VISION_SIZE, actions)
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """Return values ``[..., A]`` for images uint8 ``[..., 64, 64, 3]``."""
+        return self.head(self.vision(pixels)).reshape(*pixels.shape[:-3], -1)
+
+
+def _head(inputs: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(inputs, _HIDDEN_SIZE), nn.LeakyReLU(LEAK), nn.Linear(_HIDDEN_SIZE, outputs))

@@ -1,0 +1,99 @@
+"""Rows of an episode that still goes on, and the future of those whose future is known."""
+
+from collections import deque
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+
+class Steps(NamedTuple):
+    """What hindsight needs to know of consecutive rows ``[..., T]`` of one environment."""
+
+    pose: Tensor
+    """``[..., T, P]`` pose at t."""
+    next_pose: Tensor
+    """``[..., T, P]`` pose at t+1."""
+    last: Tensor
+    """``[..., T]`` bool: the row ends its episode."""
+    solved: Tensor
+    """``[..., T]`` bool: the row earned a positive reward or terminated, so its next pose is no failure's."""
+
+
+def future_poses(steps: Steps, count: int, max_distance: int) -> tuple[Tensor, Tensor]:
+    """Returns the future of the first ``count`` of T consecutive rows.
+
+    Args:
+        steps: The rows, ``[T]``.
+        count: How many of them to stamp; those after them serve as their future only.
+        max_distance: D, steps to look ahead.
+
+    Returns:
+        Poses ``[count, D, P]``, and the horizon ``[count, 1]`` int64: how many of them may serve as a goal.
+    """
+    total = len(steps.last)
+    time = torch.arange(total, device=steps.last.device)
+    end = _first_at_or_after(torch.where(steps.last, time, total - 1))[:count]
+    solved = _first_at_or_after(torch.where(steps.solved, time, total))[:count]
+    now = time[:count]
+    horizon = torch.minimum(end + 1, solved).sub_(now).clamp_(max=max_distance)
+    ahead = torch.arange(max_distance, device=now.device)
+    poses = steps.next_pose[torch.minimum(now[:, None] + ahead, end[:, None])]
+    return poses, horizon[:, None]
+
+
+def _first_at_or_after(time: Tensor) -> Tensor:
+    """Returns, for each position, the smallest entry from there on."""
+    return time.flip(0).cummin(0).values.flip(0)
+
+
+class UnfinishedEpisode:
+    """One environment's latest rows, whose future is not known yet.
+
+    A queue of chunks, so that a row's images are copied once, however few rows come at a time.
+    """
+
+    def __init__(self) -> None:
+        self.chunks: deque[TensorDictBase] = deque()
+        self.steps: Steps
+
+    @property
+    def count(self) -> int:
+        """Rows held."""
+        return len(self.steps.last) if self.chunks else 0
+
+    def count_known(self, max_distance: int) -> int:
+        """Rows, from the first on, whose next ``max_distance`` poses are known, or all those to their episode's end."""
+        ended = self.steps.last.nonzero()
+        return max(int(ended[-1]) + 1 if len(ended) else 0, self.count - max_distance + 1, 0)
+
+    def append(self, rows: TensorDictBase, steps: Steps) -> None:
+        """Adds rows ``[T]``."""
+        held = (self.steps, steps) if self.chunks else (steps,)
+        self.steps = Steps(*(torch.cat(entries) for entries in zip(*held, strict=True)))
+        self.chunks.append(rows)
+
+    def pop(self, count: int) -> list[TensorDictBase]:
+        """Takes the first ``count`` rows away, as consecutive chunks."""
+        popped = []
+        self.steps = Steps(*(entry[count:].clone() for entry in self.steps))
+        while count:
+            chunk = self.chunks.popleft()
+            if len(chunk) > count:
+                self.chunks.appendleft(chunk[count:])
+            popped.append(chunk[:count])
+            count -= len(popped[-1])
+        return popped
+
+    def own_last_chunk(self) -> None:
+        """Copies the newest rows: collectors may write their next batch into the same memory."""
+        if self.chunks:
+            self.chunks[-1] = self.chunks[-1].clone()
+
+
+def concatenate(chunks: list[TensorDictBase]) -> TensorDictBase | None:
+    """Joins chunks of rows; None if there are none."""
+    if not chunks:
+        return None
+    return chunks[0] if len(chunks) == 1 else torch.cat(chunks)

@@ -1,0 +1,55 @@
+"""What the tests of the environments share."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+import envs
+
+
+class Stage:
+    """An environment in which a test puts robot and box where it wants them."""
+
+    def __init__(self, environment: envs.Environment) -> None:
+        self.environment = environment
+        self.task = environment.task
+        self.rover = environment.task.rover
+        self.box = environment.task.goal_box
+
+    @property
+    def physics(self) -> Any:
+        return self.environment.physics
+
+    def place(self, pose: tuple[float, float, float], box: tuple[float, float] = (-0.6, -0.6)) -> None:
+        self.environment.reset()
+        self.rover.set_pose(self.physics, np.array(pose))
+        self.box.set_position(self.physics, np.array(box))
+        mujoco.mj_forward(self.physics.model.ptr, self.physics.data.ptr)
+
+    def step(self, forward: float = 0.0, turn: float = 0.0) -> Any:
+        return self.environment.step(np.array([forward, turn]))
+
+    def pose(self) -> np.ndarray:
+        return self.rover.pose(self.physics)
+
+
+@pytest.fixture(scope="module")
+def room_2m() -> Iterator[envs.Environment]:
+    environment = envs.navigate_2m(random_state=0)
+    yield environment
+    environment.close()
+
+
+@pytest.fixture
+def stage(room_2m: envs.Environment) -> Stage:
+    return Stage(room_2m)
+
+
+@pytest.fixture(params=sorted(envs.NAMES))
+def named_environment(request: pytest.FixtureRequest) -> Iterator[envs.Environment]:
+    environment = envs.named(request.param)(random_state=3)
+    yield environment
+    environment.close()

@@ -1,0 +1,151 @@
+import time
+
+import numpy as np
+import pytest
+
+import envs
+from envs.arenas.walled_room import WalledRoom
+from envs.props.goal_box import GoalBox
+from envs.robots.rover import Rover
+from envs.tasks.navigate import Navigate
+
+
+def make_task(size=2.0, **arguments):
+    return Navigate(Rover(), WalledRoom(size=size), GoalBox(), **arguments)
+
+
+def test_standing_before_the_box_pays_one_and_terminates(stage):
+    stage.place((0.1, 0.2, 0.0), box=(0.1 + 0.14, 0.2))
+    timestep = stage.step()
+    assert timestep.reward == 1.0
+    assert timestep.last()
+    assert timestep.discount == 0.0
+
+
+def test_the_cost_of_an_action_is_its_norm(stage):
+    stage.place((0.1, 0.2, 0.0))
+    timestep = stage.step(forward=0.6, turn=-0.8)
+    assert timestep.reward == pytest.approx(-0.0025)
+    assert not timestep.last()
+    assert timestep.discount == 1.0
+
+
+@pytest.mark.parametrize(
+    ("pose", "why"),
+    [
+        ((0.07, 0.2, 0.0), "17 cm away"),
+        ((0.1, 0.2 - 0.025, 0.0), "2.5 cm beside the optical axis"),
+        ((0.1, 0.2, np.pi), "behind"),
+        ((0.1, 0.2, 0.3), "turned away"),
+    ],
+)
+def test_no_success_when_the_box_is(stage, pose, why):
+    stage.place(pose, box=(0.24, 0.2))
+    assert not stage.step().last(), why
+
+
+def test_the_time_limit_truncates_after_200_steps(stage):
+    stage.place((0.1, 0.2, 0.0))
+    steps = 0
+    last = False
+    while not last:
+        timestep = stage.step(turn=0.3)
+        steps, last = steps + 1, timestep.last()
+    assert steps == 200
+    assert timestep.discount == 1.0
+
+
+def test_starts_are_far_apart_free_and_reachable(named_environment):
+    task, random_state = named_environment.task, np.random.RandomState(0)
+    half = task.arena.size / 2
+    for _ in range(2000):
+        pose, box = task.draw_start(random_state)
+        assert np.hypot(*(pose[:2] - box)) >= 1.0
+        assert np.abs(pose[:2]).max() <= half - task.rover.radius
+        # Room for the robot between box and wall.
+        assert np.abs(box).max() <= half - task.goal_box.radius - 2 * task.rover.radius
+        assert -np.pi <= pose[2] <= np.pi
+
+
+def test_episodes_start_without_contact(named_environment):
+    for _ in range(30):
+        named_environment.reset()
+        assert named_environment.physics.data.ncon == 0
+
+
+def test_every_named_environment_keeps_its_spec(named_environment):
+    spec = named_environment.observation_spec()
+    random_state = np.random.RandomState(1)
+    timestep = named_environment.reset()
+    assert {name: (s.shape, s.dtype) for name, s in spec.items()} == {
+        "rover/pixels": ((64, 64, 3), np.uint8),
+        "rover/pose": ((3,), np.float32),
+    }
+    for _ in range(20):
+        for name, value in timestep.observation.items():
+            spec[name].validate(value)
+        timestep = named_environment.step(random_state.uniform(-1, 1, size=2))
+        assert -0.0025 * np.sqrt(2) <= timestep.reward <= 1.0
+
+
+def test_the_rooms_have_the_paper_s_size_and_the_small_one():
+    sizes = {}
+    for name, build in envs.NAMES.items():
+        environment = build(random_state=0)
+        sizes[name] = (environment.task.arena.size, environment.task.centring_tolerance)
+        environment.close()
+    assert sizes == {"navigate-4m": (4.0, 0.01), "navigate-2m": (2.0, 0.02)}
+
+
+def test_a_reset_never_recompiles(room_2m):
+    room_2m.reset()
+    model, camera = room_2m.physics.model.ptr, room_2m.task.rover.camera
+    start = time.perf_counter()
+    for _ in range(20):
+        room_2m.reset()
+    assert room_2m.physics.model.ptr is model
+    assert room_2m.task.rover.camera is camera
+    assert (time.perf_counter() - start) / 20 < 0.03
+
+
+def test_equal_seeds_give_equal_episodes():
+    first, second = (run_episode(envs.navigate_2m(random_state=7)) for _ in range(2))
+    np.testing.assert_array_equal(first[0], second[0])
+    np.testing.assert_array_equal(first[1], second[1])
+    other = run_episode(envs.navigate_2m(random_state=8))
+    assert (first[1] != other[1]).any()
+
+
+def run_episode(environment):
+    actions = np.random.RandomState(0)
+    observations = [environment.reset().observation]
+    observations += [environment.step(actions.uniform(-1, 1, size=2)).observation for _ in range(10)]
+    environment.close()
+    return tuple(np.stack([o[name] for o in observations]) for name in ("rover/pixels", "rover/pose"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"size": 1.0}, "room of 1.0 m is too small for min_start_distance=1.0"),
+        ({"size": 0.3, "min_start_distance": 0.2}, "too small"),
+        ({"success_distance": 0.05}, "success_distance=0.05 m cannot be reached"),
+        ({"centring_tolerance": 0.0}, "centring_tolerance must be positive; got 0.0"),
+        ({"min_start_distance": 0.1}, "min_start_distance=0.1 m must exceed success_distance=0.16"),
+        ({"min_start_distance": float("nan")}, "min_start_distance=nan"),
+    ],
+)
+def test_bad_tasks_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        make_task(**arguments)
+
+
+@pytest.mark.parametrize("build", [lambda: WalledRoom(size=0.0), lambda: GoalBox(size=-1.0)])
+def test_bad_sizes_are_refused(build):
+    with pytest.raises(ValueError, match="must be positive; got"):
+        build()
+
+
+def test_an_unknown_name_lists_the_known_ones():
+    with pytest.raises(ValueError, match=r"'navigate-3m'.*navigate-2m, navigate-4m"):
+        envs.make("navigate-3m")

@@ -1,0 +1,159 @@
+import functools
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.envs import ParallelEnv
+from torchrl.envs.utils import check_env_specs
+
+import envs
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = envs.make("navigate-2m", seed=0)
+    yield env
+    env.close()
+
+
+def place(env, pose, box):
+    env.reset()
+    env.rover.set_pose(env.environment.physics, np.array(pose))
+    env.environment.task.goal_box.set_position(env.environment.physics, np.array(box))
+    env.environment.physics.forward()
+
+
+def act(*action):
+    return TensorDict({"action": torch.tensor(action, dtype=torch.float32)}, [])
+
+
+@pytest.mark.parametrize("name", sorted(envs.NAMES))
+def test_every_named_environment_passes_torchrl_s_check(name):
+    env = envs.make(name, seed=0)
+    check_env_specs(env)
+    env.close()
+
+
+def test_success_is_terminated_not_truncated(env):
+    place(env, (0.0, 0.1, 0.0), box=(0.14, 0.1))
+    out = env.step(act(0.0, 0.0))["next"]
+    assert out["reward"].item() == 1.0
+    assert (out["done"].item(), out["terminated"].item(), out["truncated"].item()) == (True, True, False)
+
+
+def test_the_time_limit_is_truncated_not_terminated():
+    env = envs.make("navigate-2m", seed=0, time_limit=0.5)
+    out = env.rollout(20)["next"]
+    env.close()
+    assert len(out) == 5
+    assert out["truncated"].squeeze().tolist() == [False] * 4 + [True]
+    assert out["done"].squeeze().tolist() == [False] * 4 + [True]
+    assert not out["terminated"].any()
+
+
+def test_set_seed_repeats_everything(env):
+    def rollout(seed):
+        env.set_seed(seed)
+        torch.manual_seed(0)
+        return env.rollout(8)
+
+    first, again, other = rollout(5), rollout(5), rollout(6)
+    assert (first == again).all()
+    assert (first["pose"] != other["pose"]).any()
+
+
+def test_seeding_at_construction_and_later_is_the_same(env):
+    fresh = envs.make("navigate-2m", seed=11)
+    env.set_seed(11)
+    assert torch.equal(fresh.reset()["pose"], env.reset()["pose"])
+    fresh.close()
+
+
+def test_observations_share_no_memory(env):
+    first = env.reset()
+    second = env.step(act(1.0, 0.5))["next"]
+    third = env.step(act(1.0, 0.5))["next"]
+    for key in ("pixels", "pose"):
+        addresses = {td[key].untyped_storage().data_ptr() for td in (first, second, third)}
+        assert len(addresses) == 3
+
+
+def test_an_image_keeps_its_content_while_the_env_goes_on(env):
+    image = env.reset()["pixels"]
+    copy = image.clone()
+    env.rollout(5)
+    assert torch.equal(image, copy)
+
+
+@pytest.mark.parametrize("action", [(float("nan"), 0.0), (0.0, 1.5), (-float("inf"), 0.0)])
+def test_bad_actions_are_refused(env, action):
+    env.reset()
+    with pytest.raises(ValueError, match=r"must lie in \[-1, 1\]; got"):
+        env.step(act(*action))
+
+
+def test_rounding_overshoot_is_clipped(env):
+    place(env, (-0.3, 0.1, 0.0), box=(0.5, 0.5))
+    out = env.step(act(1.0 + 1e-6, 0.0))["next"]
+    assert out["reward"].item() == pytest.approx(-0.0025)
+
+
+def test_a_step_after_the_end_asks_for_a_reset(env):
+    place(env, (0.0, 0.1, 0.0), box=(0.14, 0.1))
+    env.step(act(0.0, 0.0))
+    with pytest.raises(RuntimeError, match="call reset"):
+        env.step(act(0.0, 0.0))
+
+
+def test_the_overview_is_a_picture_of_the_asked_size(env):
+    env.reset()
+    picture = env.render_overview(height=90, width=120)
+    assert picture.shape == (90, 120, 3)
+    assert picture.dtype == np.uint8
+    assert picture.std() > 10
+
+
+def test_the_overview_does_not_disturb_the_agent_s_images(env):
+    env.set_seed(3)
+    before = env.reset()["pixels"]
+    env.render_overview()
+    env.set_seed(3)
+    assert torch.equal(env.reset()["pixels"], before)
+
+
+def test_two_environments_in_one_process_do_not_mix():
+    first, second = envs.make("navigate-2m", seed=1), envs.make("navigate-4m", seed=2)
+    alone = envs.make("navigate-2m", seed=1)
+    expected = alone.reset()["pixels"]
+    second.reset()
+    image = first.reset()["pixels"]
+    assert torch.equal(image, expected)
+    for env in (alone, second, first):
+        env.close()
+
+
+def test_it_runs_in_parallel_under_spawn():
+    make = functools.partial(envs.make, "navigate-2m")
+    env = ParallelEnv(2, [functools.partial(make, seed=s) for s in (0, 1)], mp_start_method="spawn")
+    try:
+        out = env.rollout(4)
+    finally:
+        env.close()
+    assert out.shape == (2, 4)
+    assert (out["pose"][0] != out["pose"][1]).any()
+    alone = make(seed=0)
+    torch.testing.assert_close(out["pixels"][0, 0], alone.reset()["pixels"])
+    alone.close()
+
+
+def test_a_collector_resets_it_by_itself():
+    collector = Collector(
+        functools.partial(envs.make, "navigate-2m", seed=0, time_limit=0.5), None, frames_per_batch=12, total_frames=12
+    )
+    (batch,) = list(collector)
+    collector.shutdown()
+    assert batch["next", "truncated"].squeeze().nonzero().squeeze().tolist() == [4, 9]
+    assert torch.equal(batch["next", "pose"][0], batch["pose"][1])
+    assert not torch.equal(batch["next", "pose"][4], batch["pose"][5])

@@ -1,0 +1,143 @@
+"""The recipe learns something, repeats itself, and refuses bad input before any work is done."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from halgan_rl.run_folder import read_metrics
+from recipes import play
+from recipes.ddpg_navigate import PRESETS, Config, main, parse_config
+
+TINY = dataclasses.replace(
+    Config(),
+    total_frames=160,
+    warmup_frames=64,
+    batch_size=8,
+    replay_capacity=200,
+    evaluate_every=80,
+    evaluation_starts=1,
+)
+
+
+def run(out: Path, **changes: object) -> dict[str, torch.Tensor]:
+    """Run the recipe; return the policy that it saved."""
+    main(dataclasses.replace(TINY, out=out, **changes))
+    return load_file(out / "policy.safetensors")
+
+
+def differ(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> set[str]:
+    """Return the names of the parameters in which two policies differ."""
+    return {name for name in one if not torch.equal(one[name], other[name])}
+
+
+@pytest.fixture(scope="module")
+def halgan_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "halgan"
+    run(out)
+    return out
+
+
+def test_every_parameter_of_the_policy_is_updated(halgan_run: Path, tmp_path: Path) -> None:
+    untrained = run(tmp_path / "untrained", total_frames=48, evaluate_every=48)
+    trained = load_file(halgan_run / "policy.safetensors")
+    assert differ(trained, untrained) == set(trained)
+
+
+def test_everything_promised_is_written(halgan_run: Path) -> None:
+    written = {path.name for path in halgan_run.iterdir()}
+    assert written == {
+        "agent.gif",
+        "config.json",
+        "curve.png",
+        "hallucinations.png",
+        "metrics.csv",
+        "policy.json",
+        "policy.safetensors",
+    }
+    metrics = read_metrics(halgan_run / "metrics.csv")
+    assert metrics["frames"] == [80, 160]
+    assert 0.05 < metrics["train/hallucinated_fraction"][-1] < 0.5
+    assert json.loads((halgan_run / "config.json").read_text())["config"]["hindsight"] == "halgan"
+
+
+def test_a_run_repeats_itself_bit_for_bit(halgan_run: Path, tmp_path: Path) -> None:
+    again = run(tmp_path / "again")
+    assert differ(load_file(halgan_run / "policy.safetensors"), again) == set()
+    first, second = (read_metrics(path / "metrics.csv") for path in (halgan_run, tmp_path / "again"))
+    assert first.pop("seconds") != second.pop("seconds")
+    assert repr(first) == repr(second)  # NaN, where no episode ended, is equal to itself as text only
+
+
+def test_seed_and_method_change_what_is_learned(halgan_run: Path, tmp_path: Path) -> None:
+    trained = load_file(halgan_run / "policy.safetensors")
+    for name, changes in {
+        "seed": {"seed": 1},
+        "oracle": {"hindsight": "oracle"},
+        "none": {"hindsight": "none"},
+    }.items():
+        assert differ(trained, run(tmp_path / name, **changes)) == set(trained), name
+    assert not (tmp_path / "none" / "hallucinations.png").exists()
+    assert read_metrics(tmp_path / "none" / "metrics.csv")["train/hallucinated_fraction"][-1] == 0
+
+
+def test_the_saved_policy_plays(halgan_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    play.main(play.Config(run=halgan_run, starts=2, gif=tmp_path / "film.gif"))
+    assert "success rate" in capsys.readouterr().out
+    assert (tmp_path / "film.gif").stat().st_size > 1000
+
+
+def test_a_folder_that_holds_a_run_is_refused_first(tmp_path: Path) -> None:
+    (tmp_path / "metrics.csv").write_text("precious")
+    with pytest.raises(FileExistsError, match="already holds a run"):
+        main(dataclasses.replace(TINY, out=tmp_path))
+    assert [path.name for path in tmp_path.iterdir()] == ["metrics.csv"]
+
+
+def test_weights_for_another_room_are_refused_before_the_folder_is_made(tmp_path: Path) -> None:
+    other = Path(__file__).parents[2] / "halgan_rl" / "shipped" / "navigate-4m.safetensors"
+    with pytest.raises(ValueError, match=r"navigate-4m.*navigate-2m"):
+        main(dataclasses.replace(TINY, out=tmp_path / "run", weights=other))
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("args", [["--no-such-flag", "1"], ["--hindsight", "magic"], ["--preset", "nature"]])
+def test_unknown_flags_and_methods_are_refused(args: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        parse_config(args)
+    assert exit_.value.code == 2
+    assert args[1] in (printed := "".join(capsys.readouterr())) or args[0] in printed
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"warmup_frames": 16}, {"batch_size": 0}, {"hallucination_start": 1.5}, {"frames_per_batch": 0}],
+    ids=lambda changes: next(iter(changes)),
+)
+def test_values_that_cannot_work_are_refused(changes: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(changes))):
+        dataclasses.replace(Config(), **changes)
+
+
+def test_the_preset_chooses_the_defaults_and_flags_win() -> None:
+    assert parse_config([]) == PRESETS["default"]
+    assert parse_config(["--preset", "paper"]) == PRESETS["paper"]
+    config = parse_config(["--preset", "paper", "--batch-size", "16"])
+    assert config == dataclasses.replace(PRESETS["paper"], batch_size=16)
+
+
+def test_the_paper_preset_is_the_papers_table() -> None:
+    paper = PRESETS["paper"]
+    assert (paper.replay_capacity, paper.warmup_frames, paper.batch_size, paper.frames_per_update) == (
+        100_000,
+        10_000,
+        32,
+        1,
+    )
+    assert (paper.actor_learning_rate, paper.critic_learning_rate, paper.target_rate) == (1e-5, 1e-4, 1e-3)
+    assert (paper.epsilon_start, paper.epsilon_end, paper.epsilon_frames) == (1.0, 0.5, 100_000)
+    assert (paper.hallucination_start, paper.hallucination_end, paper.max_distance) == (0.3, 0.0, 32)
+    assert (paper.discount, paper.noise, paper.clip_targets) == (0.99, 0.1, False)

@@ -1,0 +1,114 @@
+import pytest
+import torch
+from torch import Tensor, nn
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+
+from halgan_rl.transforms import HallucinateGoal
+from tests import toy
+from tests.transforms.rows import assert_identical, invert, sampled_rows
+
+MASKED = [1, 2, 3, 4, 7, 8, 9, 10]
+
+
+class Recorder:
+    """A hallucinator that remembers what it was given."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[Tensor, Tensor, Tensor]] = []
+
+    def __call__(self, pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
+        self.calls.append((pixels, pose, goal_pose))
+        return pixels
+
+
+class Painter(nn.Module):
+    """A hallucinator that is a network, as careless users pass it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.brush = nn.Linear(3, 3)
+
+    def forward(self, pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
+        assert not torch.is_grad_enabled()
+        return pixels + self.brush(pose)[..., :1, None, None].abs().ceil().to(torch.uint8)
+
+
+def test_masked_rows_get_what_the_hallucinator_makes_of_their_own_frames_and_poses() -> None:
+    rows = sampled_rows()
+    out = HallucinateGoal(invert)(rows)
+    for at in MASKED:
+        goal = rows["goal", "pose"][at]
+        assert torch.equal(out["pixels"][at], invert(rows["pixels"][at], rows["pose"][at], goal))
+        after = rows["next"][at]
+        assert torch.equal(out["next", "pixels"][at], invert(after["pixels"], after["pose"], goal))
+
+
+def test_both_paths_give_equal_results() -> None:
+    assert_identical(HallucinateGoal(invert)(sampled_rows()), HallucinateGoal(invert, fixed_shape=True)(sampled_rows()))
+
+
+def test_only_masked_rows_are_hallucinated_both_frames_in_one_call() -> None:
+    rows, recorder = sampled_rows(), Recorder()
+    HallucinateGoal(recorder)(rows)
+    [(pixels, pose, goal_pose)] = recorder.calls
+    assert torch.equal(pixels, torch.stack([rows["pixels"], rows["next", "pixels"]], 1)[MASKED])
+    assert torch.equal(pose, torch.stack([rows["pose"], rows["next", "pose"]], 1)[MASKED])
+    assert torch.equal(goal_pose, rows["goal", "pose"][MASKED, None])
+
+
+def test_nothing_is_hallucinated_when_no_row_is_masked() -> None:
+    rows, recorder = sampled_rows(), Recorder()
+    rows["goal", "mask"].zero_()
+    assert_identical(HallucinateGoal(recorder)(rows), rows)
+    assert not recorder.calls
+
+
+def test_with_fixed_shapes_the_hallucinator_always_sees_all_rows() -> None:
+    recorder = Recorder()
+    for mask in (False, True):
+        rows = sampled_rows()
+        rows["goal", "mask"].fill_(mask)
+        HallucinateGoal(recorder, fixed_shape=True)(rows)
+    assert [call[0].shape for call in recorder.calls] == [(12, 2, 4, 5, 3)] * 2
+
+
+def test_an_exact_hallucinator_shows_what_would_have_been_seen() -> None:
+    pose = torch.tensor([[0.0, 0.0, 0.0], [3.0, -2.0, torch.pi / 2]])
+    elsewhere, goal = torch.tensor([[1.0, 1.0, 0.0]]), torch.tensor([[4.0, 1.0, torch.pi]])
+    seen = toy.hallucinate(toy.render(pose, elsewhere), pose, goal)
+    assert torch.equal(seen, toy.render(pose, goal))
+    assert not torch.equal(seen, toy.render(pose, elsewhere))
+
+
+def test_a_network_stays_out_of_the_buffers_state_and_keeps_its_mode() -> None:
+    painter = Painter().train()
+    transform = HallucinateGoal(painter)
+    buffer = ReplayBuffer(storage=LazyTensorStorage(12), batch_size=6)
+    buffer.extend(sampled_rows())
+    buffer.append_transform(transform)
+    buffer.sample()
+    assert painter.training
+    assert not list(transform.parameters())
+    assert not buffer.state_dict()["_transforms"]
+
+
+def test_no_gradient_reaches_a_network() -> None:
+    assert not HallucinateGoal(Painter())(sampled_rows())["pixels"].requires_grad
+
+
+@pytest.mark.parametrize(
+    ("wrong", "returned"),
+    [
+        (lambda pixels, pose, goal_pose: pixels / 255, r"torch\.float32 \(8, 2, 4, 5, 3\)"),
+        (lambda pixels, pose, goal_pose: pixels[:, 0], r"torch\.uint8 \(8, 4, 5, 3\)"),
+    ],
+    ids=["dtype", "shape"],
+)
+def test_a_hallucinator_that_returns_something_else_is_named(wrong: object, returned: str) -> None:
+    with pytest.raises(ValueError, match=rf"must return .* torch\.uint8 \(8, 2, 4, 5, 3\), but returned {returned}"):
+        HallucinateGoal(wrong)(sampled_rows())
+
+
+def test_what_cannot_be_called_is_refused() -> None:
+    with pytest.raises(TypeError, match=r"must be callable .*'generator\.safetensors'"):
+        HallucinateGoal("generator.safetensors")

@@ -1,0 +1,320 @@
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
+
+from halgan_rl.transforms import DrawHindsightGoal, StampFuturePoses
+from tests.transforms.rows import assert_identical, random_source, stamped_by_reference
+
+STEP, REWARDED, TRUNCATED, TERMINATED, SOLVED = "step", "rewarded", "truncated", "terminated", "solved"
+ENDS = (TRUNCATED, TERMINATED, SOLVED)
+SUCCESSES = (REWARDED, TERMINATED, SOLVED)
+
+
+@dataclass
+class Environment:
+    """Makes rows whose poses say where they come from: (environment, episode, 0.01 · time)."""
+
+    number: int = 0
+    episode: int = 0
+    time: int = 0
+    count: int = 0
+
+    def row(self, event: str) -> dict:
+        """The next row; ``id`` tells it from all others."""
+        pose = self.pose(self.time)
+        row = {
+            "id": torch.tensor([1000 * self.number + self.count]),
+            "pixels": torch.full((2, 2, 3), self.count % 256, dtype=torch.uint8),
+            "pose": pose,
+            "next": {
+                "pixels": torch.full((2, 2, 3), 255 - self.count % 256, dtype=torch.uint8),
+                "pose": self.pose(self.time + 1),
+                "reward": torch.tensor([1.0 if event in (REWARDED, SOLVED) else -0.5]),
+                "done": torch.tensor([event in ENDS]),
+                "terminated": torch.tensor([event in (TERMINATED, SOLVED)]),
+                "truncated": torch.tensor([event == TRUNCATED]),
+            },
+        }
+        self.count += 1
+        self.episode, self.time = (self.episode + 1, 0) if event in ENDS else (self.episode, self.time + 1)
+        return row
+
+    def pose(self, time: int) -> torch.Tensor:
+        return torch.tensor([self.number, self.episode, 0.01 * time])
+
+
+def rows(*events: str, environment: Environment | None = None) -> TensorDict:
+    """Consecutive rows ``[T]`` of one environment."""
+    environment = environment or Environment()
+    return torch.stack([TensorDict(environment.row(event)) for event in events])
+
+
+def horizons(out: TensorDictBase) -> list[int]:
+    return out["hindsight", "horizon"].flatten().tolist()
+
+
+def times(out: TensorDictBase) -> list[list[int]]:
+    """The time, counted in steps, of each row's future poses."""
+    return (out["hindsight", "pose"][..., 2] * 100).round().int().tolist()
+
+
+# What is stamped
+
+
+def test_each_row_learns_the_poses_after_its_own() -> None:
+    out = StampFuturePoses(3).inv(rows(*[STEP] * 5))
+    assert times(out) == [[1, 2, 3], [2, 3, 4], [3, 4, 5]]
+    assert horizons(out) == [3, 3, 3]
+    assert (out["hindsight", "pose"].shape, out["hindsight", "horizon"].shape) == ((3, 3, 3), (3, 1))
+    assert (out["hindsight", "pose"].dtype, out["hindsight", "horizon"].dtype) == (torch.float32, torch.int64)
+
+
+def test_the_last_pose_before_the_time_limit_is_a_usable_goal() -> None:
+    out = StampFuturePoses(3).inv(rows(STEP, STEP, STEP, TRUNCATED))
+    assert times(out) == [[1, 2, 3], [2, 3, 4], [3, 4, 4], [4, 4, 4]]
+    assert horizons(out) == [3, 3, 2, 1]
+
+
+@pytest.mark.parametrize("success", [TERMINATED, SOLVED])
+def test_the_pose_reached_by_success_is_not_a_usable_goal(success: str) -> None:
+    assert horizons(StampFuturePoses(3).inv(rows(STEP, STEP, STEP, success))) == [3, 2, 1, 0]
+
+
+def test_a_positive_reward_in_mid_episode_bounds_the_horizon() -> None:
+    assert horizons(StampFuturePoses(4).inv(rows(STEP, STEP, REWARDED, STEP, TRUNCATED))) == [2, 1, 0, 2, 1]
+
+
+def test_termination_ends_an_episode_even_without_the_done_flag() -> None:
+    stream = rows(STEP, TERMINATED, STEP, TRUNCATED)
+    stream["next", "done"][1] = False
+    assert times(StampFuturePoses(3).inv(stream)) == [[1, 2, 2], [2, 2, 2], [1, 2, 2], [2, 2, 2]]
+
+
+def test_rows_keep_everything_else_bit_for_bit() -> None:
+    stream = rows(STEP, STEP, TRUNCATED, STEP, SOLVED)
+    assert_identical(StampFuturePoses(3).inv(stream).exclude("hindsight"), stream)
+
+
+# When rows are written
+
+
+def test_rows_wait_until_their_future_is_known() -> None:
+    stamp, environment = StampFuturePoses(3), Environment()
+    assert stamp.inv(rows(STEP, environment=environment)) is None
+    assert stamp.inv(rows(STEP, environment=environment)) is None
+    assert stamp.inv(rows(STEP, environment=environment))["id"].flatten().tolist() == [0]
+    assert stamp.inv(rows(TRUNCATED, environment=environment))["id"].flatten().tolist() == [1, 2, 3]
+    assert stamp.flush() is None
+
+
+def test_several_environments_are_written_one_after_the_other_each_in_order() -> None:
+    stamp = StampFuturePoses(2)
+    first = rows(STEP, TRUNCATED, STEP, STEP, environment=Environment(0))
+    second = rows(STEP, STEP, STEP, STEP, environment=Environment(1))
+    assert stamp.inv(torch.stack([first, second]))["id"].flatten().tolist() == [0, 1, 2, 1000, 1001, 1002]
+
+
+@st.composite
+def batches(draw: st.DrawFn) -> list[TensorDict]:
+    """What a collector may yield: batches ``[E, T]`` of one to three environments, which split episodes anywhere."""
+    environments = [Environment(number) for number in range(draw(st.integers(1, 3)))]
+    lengths = draw(st.lists(st.integers(1, 7), min_size=1, max_size=8))
+    events = st.sampled_from([STEP] * 8 + [REWARDED, TRUNCATED, TERMINATED, SOLVED])
+    return [
+        torch.stack([rows(*(draw(events) for _ in range(length)), environment=each) for each in environments])
+        for length in lengths
+    ]
+
+
+@settings(max_examples=50, deadline=None)
+@given(batches(), st.integers(1, 6))
+def test_any_stream_in_any_batches_is_stamped_like_the_reference(batches: list[TensorDict], distance: int) -> None:
+    stamp = StampFuturePoses(distance)
+    out = [each for each in (*map(stamp.inv, batches), stamp.flush()) if each is not None]
+    stream = torch.cat(batches, dim=1)
+    for environment in stream:
+        mine = torch.cat([each[each["id"][:, 0] // 1000 == environment["id"][0] // 1000] for each in out])
+        assert_identical(mine, stamped_by_reference(environment, distance))
+    assert sum(map(len, out)) == stream.numel()
+
+
+@settings(max_examples=30, deadline=None)
+@given(batches(), st.integers(1, 6), st.integers(0, 20))
+def test_no_goal_crosses_an_episode_also_after_the_ring_wraps(
+    batches: list[TensorDict], distance: int, slack: int
+) -> None:
+    most = batches[0].shape[0] * (max(batch.shape[1] for batch in batches) + distance)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(most + slack), batch_size=64)
+    buffer.append_transform(StampFuturePoses(distance))
+    buffer.append_transform(DrawHindsightGoal(1.0, generator=random_source(), tolerance=None))
+    reference = torch.cat([stamped_by_reference(stream, distance) for stream in torch.cat(batches, dim=1)])
+    for batch in batches:
+        buffer.extend(batch)
+        if len(buffer) == 0:
+            continue
+        sample = buffer.sample()
+        row = torch.stack([reference[(reference["id"] == each).flatten()][0] for each in sample["id"]])
+        assert_identical(sample.exclude("goal", "index"), row)
+        assert torch.equal(sample["goal", "mask"], row["hindsight", "horizon"] > 0)
+        pose, goal = sample["pose"], sample["goal", "pose"]
+        assert torch.equal(goal[:, :2], pose[:, :2]), "a goal in another environment or episode"
+        assert (goal[:, 2] > pose[:, 2]).all(), "a goal that is not later than its row"
+
+
+def test_a_batch_of_no_rows_changes_nothing() -> None:
+    stamp, environment = StampFuturePoses(3), Environment()
+    stamp.inv(rows(STEP, STEP, environment=environment))
+    assert stamp.inv(rows(STEP)[:0]) is None
+    assert times(stamp.inv(rows(STEP, environment=environment))) == [[1, 2, 3]]
+
+
+# Rows held back
+
+
+def test_flush_releases_the_rows_of_the_unfinished_episode_with_what_is_known() -> None:
+    stamp = StampFuturePoses(4)
+    assert stamp.inv(rows(STEP, STEP, REWARDED)) is None
+    out = stamp.flush()
+    assert times(out) == [[1, 2, 3, 3], [2, 3, 3, 3], [3, 3, 3, 3]]
+    assert horizons(out) == [2, 1, 0]
+    assert stamp.flush() is None
+
+
+def test_flushed_rows_are_written_as_they_are() -> None:
+    stamp = StampFuturePoses(4)
+    buffer = ReplayBuffer(storage=LazyTensorStorage(10), transform=stamp, batch_size=2)
+    buffer.extend(rows(STEP, STEP))
+    assert len(buffer) == 0
+    buffer.extend(stamp.flush())
+    assert horizons(buffer[:]) == [2, 1]
+
+
+def test_after_flush_a_new_episode_may_start_in_mid_episode() -> None:
+    stamp = StampFuturePoses(2)
+    stamp.inv(rows(STEP, STEP))
+    stamp.flush()
+    assert times(stamp.inv(rows(STEP, STEP, environment=Environment(episode=7)))) == [[1, 2]]
+
+
+def test_rows_held_back_do_not_change_when_the_collector_reuses_its_memory() -> None:
+    stamp, environment = StampFuturePoses(3), Environment()
+    batch = rows(STEP, STEP, environment=environment)
+    kept = batch.clone()
+    stamp.inv(batch)
+    batch.zero_()
+    out = stamp.inv(rows(STEP, TRUNCATED, environment=environment))
+    assert_identical(out[:2].exclude("hindsight"), kept)
+
+
+@pytest.mark.parametrize("save", ["state_dict", "dumps"])
+def test_rows_held_back_survive_a_checkpoint(save: str, tmp_path: Path) -> None:
+    def make() -> ReplayBuffer:
+        return ReplayBuffer(storage=LazyTensorStorage(20), transform=StampFuturePoses(3), batch_size=2)
+
+    environments = [Environment(0), Environment(1)]
+
+    def batch(*events: str) -> TensorDictBase:
+        return torch.stack([rows(*events, environment=environment) for environment in environments])
+
+    buffer = make()
+    buffer.extend(batch(TRUNCATED, STEP, STEP, STEP))
+    restored = make()
+    if save == "state_dict":
+        restored.load_state_dict(buffer.state_dict())
+    else:
+        buffer.dumps(tmp_path / "buffer")
+        restored.loads(tmp_path / "buffer")
+    rest = batch(STEP, TRUNCATED)
+    for each in (buffer, restored):
+        each.extend(rest)
+    assert len(restored) == 12
+    assert_identical(restored[:], buffer[:])
+
+
+def test_a_state_dict_does_not_change_when_more_rows_come() -> None:
+    stamp, environment = StampFuturePoses(3), Environment()
+    stamp.inv(rows(STEP, STEP, environment=environment))
+    state = stamp.state_dict()
+    stamp.inv(rows(STEP, TRUNCATED, environment=environment))
+    restored = StampFuturePoses(3)
+    restored.load_state_dict(state)
+    assert restored.flush()["id"].flatten().tolist() == [0, 1]
+
+
+# Bad input
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize(("key", "name"), [("pose", "pose"), (("next", "pose"), r"next\.pose")])
+def test_a_pose_that_is_not_finite_never_enters_the_buffer(key: object, name: str, value: float) -> None:
+    stamp, environment = StampFuturePoses(2), Environment()
+    buffer = ReplayBuffer(storage=LazyTensorStorage(10), transform=stamp, batch_size=2)
+    buffer.extend(rows(STEP, STEP, environment=environment))
+    good = rows(STEP, STEP, TRUNCATED, environment=environment)
+    bad = good.clone()
+    bad[key][1, 2] = value
+    with pytest.raises(ValueError, match=rf"^The entry {name} is not finite: \[.*{value}\] in row 1 of environment 0"):
+        buffer.extend(bad)
+    assert len(buffer) == 1
+    buffer.extend(good)
+    assert horizons(buffer[:]) == [2, 2, 2, 2, 1]
+
+
+def test_shuffled_rows_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"^Row 1 of environment 0 starts at \[0\.0, 0\.0, 0\.02\], not .*consecutive"):
+        StampFuturePoses(2).inv(rows(*[STEP] * 4)[[0, 2, 1, 3]])
+
+
+def test_rows_of_several_environments_joined_in_time_are_refused() -> None:
+    joined = torch.cat([rows(STEP, STEP), rows(STEP, STEP, environment=Environment(1))])
+    with pytest.raises(ValueError, match=r"^Row 2 of environment 0 .*cat_results='stack'"):
+        StampFuturePoses(2).inv(joined)
+
+
+def test_a_reset_in_mid_episode_is_refused_with_the_remedy() -> None:
+    stamp = StampFuturePoses(2)
+    stamp.inv(rows(STEP, STEP))
+    with pytest.raises(ValueError, match=r"^Row 0 of environment 0 .*extend\(transform\.flush\(\)\)"):
+        stamp.inv(rows(STEP, STEP))
+
+
+def test_another_number_of_environments_is_refused_with_the_remedy() -> None:
+    stamp = StampFuturePoses(2)
+    stamp.inv(rows(STEP, STEP))
+    two = torch.stack([rows(STEP), rows(STEP, environment=Environment(1))])
+    with pytest.raises(ValueError, match=r"from 2 environments .* from 1\. .*flush"):
+        stamp.inv(two)
+
+
+def test_a_row_written_by_add_is_refused_with_the_remedy() -> None:
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10), transform=StampFuturePoses(2), batch_size=2)
+    with pytest.raises(ValueError, match=r"extend\(row\.unsqueeze\(0\)\)"):
+        buffer.add(rows(STEP)[0])
+
+
+def test_a_pose_without_yaw_is_refused() -> None:
+    short = rows(STEP, STEP)
+    short["next", "pose"] = short["next", "pose"][..., :2]
+    with pytest.raises(ValueError, match=r"the entry next\.pose has shape \(1, 2, 2\)"):
+        StampFuturePoses(2).inv(short)
+
+
+def test_a_pose_of_another_size_than_before_is_refused() -> None:
+    stamp, environment = StampFuturePoses(2), Environment()
+    stamp.inv(rows(STEP, environment=environment))
+    flagged = rows(STEP, environment=environment)
+    flagged["pose"] = torch.cat([flagged["pose"], torch.ones(1, 1)], dim=-1)
+    with pytest.raises(ValueError, match=r"entry pose has 4 numbers, the pose before it 3"):
+        stamp.inv(flagged)
+
+
+@pytest.mark.parametrize("distance", [0, -3])
+def test_looking_less_than_one_step_ahead_is_refused(distance: int) -> None:
+    with pytest.raises(ValueError, match=f"max_distance must be at least 1 step, got {distance}"):
+        StampFuturePoses(distance)
