@@ -16,7 +16,7 @@ _MAX_GEOMS = 100
 
 
 class PersistentCamera:
-    """Renders one fixed camera of a compiled model again and again, about six times faster than ``physics.render``.
+    """Renders one fixed camera of a compiled model again and again, about five times faster than ``physics.render``.
 
     ``physics.render`` builds an ``MjvScene`` a frame. This camera builds scene and context once. The context is
     dm_control's, which frees itself before the process ends; :meth:`close` frees it earlier. As every OpenGL context

@@ -40,7 +40,7 @@ class GanHallucinator:
         ValueError: if poses have another size than those that the network was trained with, or are not finite.
     """
 
-    def __init__(self, generator: HallucinationGenerator, *, rng: torch.Generator, chunk: int = 4) -> None:
+    def __init__(self, generator: HallucinationGenerator, *, rng: torch.Generator, chunk: int = 2) -> None:
         self._generator, self._rng, self._chunk = generator, rng, chunk
 
     @torch.no_grad()

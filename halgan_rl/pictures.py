@@ -12,20 +12,25 @@ Curve = Mapping[str, Sequence[float]]
 
 
 def draw_learning_curves(
-    path: Path, curves: Mapping[str, Curve], *, title: str, column: str = "eval/success_rate"
+    path: Path, methods: Mapping[str, Sequence[Curve]], *, title: str, column: str = "eval/success_rate"
 ) -> None:
-    """Draw one column of several runs' metrics over frames.
+    """Draw one column of the runs' metrics over frames; runs of one method share a colour, their mean is bold.
 
     Args:
         path: the PNG to write.
-        curves: for each label, the columns of a ``metrics.csv``; ``frames`` and ``column`` are drawn.
+        methods: for each method its runs, each the columns of a ``metrics.csv``; ``frames`` and ``column`` are drawn.
         title: heading of the picture.
         column: a rate in [0, 1].
     """
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.subplots()
-    for label, curve in curves.items():
-        axes.plot(curve["frames"], curve[column], marker=".", label=label)
+    for index, (method, runs) in enumerate(methods.items()):
+        for run in runs:
+            axes.plot(run["frames"], run[column], color=f"C{index}", alpha=0.35 if len(runs) > 1 else 1.0)
+        length = min(len(run["frames"]) for run in runs)
+        mean = np.mean([run[column][:length] for run in runs], axis=0)
+        label = f"{method} ({len(runs)} seeds)" if len(runs) > 1 else method
+        axes.plot(runs[0]["frames"][:length], mean, color=f"C{index}", linewidth=2.5, label=label)
     axes.set(title=title, xlabel="environment frames", ylabel=column, ylim=(-0.03, 1.03))
     axes.grid(alpha=0.3)
     axes.legend()

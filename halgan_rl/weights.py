@@ -98,11 +98,13 @@ def load_generator(
         raise ValueError(f"{path} holds a {kind!r}, no generator: choose one of {', '.join(GENERATORS)}")
     if manifest.get("environment") != expected["environment"]:
         raise ValueError(
-            f"{path} was trained for {manifest.get('environment')!r}, not for {expected['environment']!r}: choose other "
-            f"weights, or train some with `python recipes/train_halgan.py --environment {expected['environment']}`"
+            f"{path} was trained for {manifest.get('environment')!r}, not for {expected['environment']!r}: choose "
+            f"other weights, or train some: `python recipes/train_halgan.py --environment {expected['environment']}`"
         )
     if arguments["pose_size"] != pose_size:
-        raise ValueError(f"{path} was trained on poses of {arguments['pose_size']} entries, not {pose_size}: train others")
+        raise ValueError(
+            f"{path} was trained on poses of {arguments['pose_size']} entries, not {pose_size}: train others"
+        )
     if manifest.get("mujoco") != expected["mujoco"] and not allow_other_mujoco:
         raise ValueError(
             f"{path} was trained with MuJoCo {manifest.get('mujoco')}, this is {expected['mujoco']}, whose images may "

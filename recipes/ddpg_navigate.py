@@ -30,9 +30,10 @@ Differences from the paper (Sahni et al., NeurIPS 2019, appendix), all undone by
 3. Batch 64, one update every second frame, instead of batch 32 and one every frame.
 4. Learning rates 1e-4 and 1e-3 instead of 1e-5 and 1e-4; target rate 5e-3 instead of 1e-3.
 5. Targets clipped to [-1, 1], the range of any return: without it the critic overestimates and the agent circles.
-6. Epsilon from 1 to 0.3 over 20,000 frames instead of to 0.5 over 100,000; 2,000 warm-up frames, not 10,000.
-7. Relabelling decays over 60,000 frames instead of 100,000 (which the paper does not state; its epsilon's span).
-8. The shipped generator is this library's (see ``recipes/train_halgan.py``); ``--weights`` takes any other.
+6. A price of 1e-4 on the square of the actor's pre-activations: without it the tanh saturates early, for good.
+7. Epsilon from 1 to 0.3 over 20,000 frames instead of to 0.5 over 100,000; 2,000 warm-up frames, not 10,000.
+8. Relabelling decays over 60,000 frames instead of 100,000 (which the paper does not state; its epsilon's span).
+9. The shipped generator is this library's (see ``recipes/train_halgan.py``); ``--weights`` takes any other.
 """
 
 import argparse
@@ -62,8 +63,8 @@ from envs import ComposerEnv, GoalRenderer
 from halgan_rl import pictures, pipelines
 from halgan_rl.evaluation import evaluate, record
 from halgan_rl.hallucinators import GanHallucinator, Hallucinator
-from halgan_rl.models.agents import Actor, Critic
-from halgan_rl.objectives import ClippedTD0Estimator
+from halgan_rl.models.agents import Actor, Critic, deterministic_policy
+from halgan_rl.objectives import ClippedTD0Estimator, UnsaturatedDDPGLoss
 from halgan_rl.poses import PoseTolerance
 from halgan_rl.run_folder import RunFolder, read_metrics, versions
 from halgan_rl.weights import load_generator, save_weights, shipped_weights
@@ -128,6 +129,8 @@ class Config:
     """How far the target networks move towards the networks at each update."""
     clip_targets: bool = True
     """Clip the critic's targets to [-1, 1]."""
+    preactivation_weight: float = 1e-4
+    """Price of the square of what goes into the actor's tanh."""
     downsample: Literal["stride", "max_pool"] = "stride"
     """How the convolutions halve the image."""
 
@@ -187,6 +190,7 @@ PRESETS = {
         critic_learning_rate=1e-4,
         target_rate=1e-3,
         clip_targets=False,
+        preactivation_weight=0.0,
         downsample="max_pool",
         epsilon_end=0.5,
         epsilon_frames=100_000,
@@ -232,19 +236,21 @@ def make_hindsight(config: Config, hallucinator: Hallucinator | None) -> Compose
     )
 
 
-def make_agent(config: Config, *, action_size: int) -> tuple[TensorDictModule, TensorDictModule]:
+def make_agent(config: Config, *, action_size: int) -> tuple[TensorDictSequential, TensorDictModule]:
     """Return actor and critic; both read the camera image alone."""
     actor = Actor(action_size, downsample=config.downsample)
     critic = Critic(action_size, downsample=config.downsample)
     return (
-        TensorDictModule(actor, in_keys=["pixels"], out_keys=["action"]),
+        deterministic_policy(actor),
         TensorDictModule(critic, in_keys=["pixels", "action"], out_keys=["state_action_value"]),
     )
 
 
 def make_loss(config: Config, actor: TensorDictModule, critic: TensorDictModule) -> tuple[DDPGLoss, SoftUpdate]:
     """Return TorchRL's DDPG loss, with the targets that the configuration asks for, and its target networks' updater."""
-    loss = DDPGLoss(actor, critic, delay_actor=True, delay_value=True)
+    loss = UnsaturatedDDPGLoss(
+        actor, critic, delay_actor=True, delay_value=True, preactivation_weight=config.preactivation_weight
+    )
     if config.clip_targets:
         estimator = ClippedTD0Estimator(low=-1.0, high=1.0, gamma=config.discount, value_network=loss.actor_critic)
         estimator.set_keys(value=loss.tensor_keys.state_action_value)
@@ -378,7 +384,7 @@ def main(config: Config) -> None:
                 "train/epsilon": float(epsilon.eps),
             }
             folder.write_metrics(metrics)
-            save_policy(folder, config, actor.module)
+            save_policy(folder, config, actor[0].module)
             for name, value in metrics.items():
                 if logger is not None:
                     logger.log_scalar(name, value, step=frames)
@@ -421,7 +427,7 @@ def draw_pictures(
     """Draw the learning curve, the trained agent, and hallucinations beside the truth."""
     title = f"{config.environment}, {config.hindsight}, seed {config.seed}"
     pictures.draw_learning_curves(
-        folder.file("curve.png"), {config.hindsight: read_metrics(folder.file("metrics.csv"))}, title=title
+        folder.file("curve.png"), {config.hindsight: [read_metrics(folder.file("metrics.csv"))]}, title=title
     )
     film = record(env, actor, partial(env.render_overview, 256, 320), seeds=range(EVALUATION_SEED, EVALUATION_SEED + 5))
     pictures.write_gif(folder.file("agent.gif"), film)

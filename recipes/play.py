@@ -11,12 +11,11 @@ from functools import partial
 from pathlib import Path
 
 import tyro
-from tensordict.nn import TensorDictModule
 
 import envs
 from halgan_rl import pictures
 from halgan_rl.evaluation import evaluate, record
-from halgan_rl.models.agents import Actor
+from halgan_rl.models.agents import Actor, deterministic_policy
 from halgan_rl.weights import load_module
 
 FIRST_SEED = 20_000
@@ -41,7 +40,7 @@ def main(config: Config) -> None:
     """Evaluate the policy of a run, and film it if asked to."""
     path = config.run / "policy.safetensors"
     network, manifest = load_module(path, Actor)
-    policy = TensorDictModule(network, in_keys=["pixels"], out_keys=["action"])
+    policy = deterministic_policy(network)
     env = envs.make(manifest["environment"])
     seeds = range(config.first_seed, config.first_seed + config.starts)
     result = evaluate(env, policy, seeds=seeds)

@@ -64,6 +64,7 @@ def test_one_goal_broadcasts_over_the_frames_of_a_row() -> None:
         ([0.011, 0.0, 0.0], False),
         ([0.008, 0.008, 0.0], False),
         ([0.0, 0.0, 0.11], False),
+        ([0.0, 0.0, -0.11], False),
         ([0.0, 0.0, 2 * math.pi - 0.05], True),
     ],
 )

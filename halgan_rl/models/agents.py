@@ -3,6 +3,8 @@
 from typing import Literal
 
 import torch
+from tensordict import NestedKey
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 
 from halgan_rl.models.halgan import LEAK
@@ -35,7 +37,8 @@ class Vision(nn.Module):
             layers += [nn.Conv2d(inputs, outputs, 5, stride=1 if pooled else 2, padding=2), nn.LeakyReLU(LEAK)]
             layers += [nn.MaxPool2d(2)] if pooled else []
         self.layers = nn.Sequential(*layers, nn.Flatten())
-        self.to(memory_format=torch.channels_last)
+        self.apply(_initialise)
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, pixels: Tensor) -> Tensor:
         """Return features ``[N, 512]`` of images uint8 ``[..., 64, 64, 3]``, N the product of the leading dimensions.
@@ -49,15 +52,20 @@ class Vision(nn.Module):
 
 
 class Actor(nn.Module):
-    """The deterministic policy of DDPG: 33,642 parameters for 2 actions.
+    """The actor of DDPG, up to the tanh that bounds its actions: 33,642 parameters for 2 actions.
+
+    :func:`deterministic_policy` adds the tanh. It is kept apart because the loss needs what goes into it: see
+    :class:`halgan_rl.objectives.UnsaturatedDDPGLoss`.
 
     Args:
         action_size: A.
         downsample: see :class:`Vision`.
 
     Examples:
-        >>> Actor()(torch.zeros(5, 1, 64, 64, 3, dtype=torch.uint8)).shape
-        torch.Size([5, 1, 2])
+        >>> from tensordict import TensorDict
+        >>> images = torch.zeros(5, 64, 64, 3, dtype=torch.uint8)
+        >>> deterministic_policy(Actor())(TensorDict({"pixels": images}, batch_size=[5]))["action"].shape
+        torch.Size([5, 2])
     """
 
     def __init__(self, action_size: int = 2, *, downsample: Downsample = "stride") -> None:
@@ -67,8 +75,29 @@ class Actor(nn.Module):
         self.head = _head(_VISION_SIZE, action_size)
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """Return actions ``[..., A]`` in [-1, 1] for images uint8 ``[..., 64, 64, 3]``."""
-        return self.head(self.vision(pixels)).tanh().reshape(*pixels.shape[:-3], -1)
+        """Return unbounded pre-activations ``[..., A]`` for images uint8 ``[..., 64, 64, 3]``."""
+        return self.head(self.vision(pixels)).reshape(*pixels.shape[:-3], -1)
+
+
+def deterministic_policy(
+    actor: Actor,
+    *,
+    pixels_key: NestedKey = "pixels",
+    preactivation_key: NestedKey = "preactivation",
+    action_key: NestedKey = "action",
+) -> TensorDictSequential:
+    """Return the policy of an actor: reads images, writes actions in [-1, 1] and what went into their tanh.
+
+    Args:
+        actor: the network.
+        pixels_key: images uint8 ``[..., 64, 64, 3]``.
+        preactivation_key: unbounded, ``[..., A]``.
+        action_key: in [-1, 1], ``[..., A]``.
+    """
+    return TensorDictSequential(
+        TensorDictModule(actor, in_keys=[pixels_key], out_keys=[preactivation_key]),
+        TensorDictModule(nn.Tanh(), in_keys=[preactivation_key], out_keys=[action_key]),
+    )
 
 
 class Critic(nn.Module):
@@ -109,4 +138,17 @@ class QNetwork(nn.Module):
 
 
 def _head(inputs: int, outputs: int) -> nn.Sequential:
-    return nn.Sequential(nn.Linear(inputs, _HIDDEN_SIZE), nn.LeakyReLU(LEAK), nn.Linear(_HIDDEN_SIZE, outputs))
+    head = nn.Sequential(nn.Linear(inputs, _HIDDEN_SIZE), nn.LeakyReLU(LEAK), nn.Linear(_HIDDEN_SIZE, outputs))
+    return head.apply(_initialise)
+
+
+def _initialise(layer: nn.Module) -> None:
+    """Start a layer as Keras does, which the authors used: Glorot's uniform weights, no bias.
+
+    PyTorch's own weights are about half as large a layer: behind six of them, one image gives almost the same features
+    as another, and the actor learns one action for all before it learns to tell them apart.
+    """
+    if isinstance(layer, nn.Conv2d | nn.Linear):
+        nn.init.xavier_uniform_(layer.weight)
+        if layer.bias is not None:
+            nn.init.zeros_(layer.bias)

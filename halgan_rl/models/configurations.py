@@ -15,8 +15,8 @@ class GoalEncoding(nn.Module):
 
     - ``"polar"``, the paper's (appendix): distance [m] and bearing [rad] to the goal position; where the positions
       coincide, the bearing is the difference of the yaws. The features are the labels.
-    - ``"planar"``: the whole relative pose: x ahead [m], y left [m], yaw difference [rad]. The features have sine and
-      cosine of the yaw: an object that the goal pose faces lies at a *linear* function of them in the frame of the pose.
+    - ``"planar"``: the whole relative pose: x ahead [m], y left [m], yaw difference [rad]. The features have sine
+      and cosine of the yaw: what the goal pose faces lies at a *linear* function of them in the frame of the pose.
 
     Flags of the task, the entries of a pose after the third, follow in both.
 

@@ -1,6 +1,7 @@
 """The networks of the paper (Sahni et al., NeurIPS 2019, appendix): generator and discriminator."""
 
 from abc import ABC, abstractmethod
+from itertools import pairwise
 from typing import Literal
 
 import torch
@@ -76,13 +77,13 @@ class PaperGenerator(HallucinationGenerator):
         self.embedding = nn.Linear(self.encoding.size, latent_size)
         layers: list[nn.Module] = []
         widths = [latent_size, 64, 64, 64, 32, 32, 16]
-        for inputs, outputs in zip(widths, widths[1:], strict=False):
+        for inputs, outputs in pairwise(widths):
             layers += [nn.Upsample(scale_factor=2), *_same_convolution(inputs, outputs)]
             layers += [nn.BatchNorm2d(outputs), nn.LeakyReLU(LEAK)]
         layers += [*_same_convolution(16, 8), nn.BatchNorm2d(8), nn.LeakyReLU(LEAK)]
         layers += [*_same_convolution(8, 3), nn.Tanh()]
         self.layers = nn.Sequential(*layers)
-        self.to(memory_format=torch.channels_last)
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, features: Tensor, latent: Tensor) -> Tensor:
         """Return H ``[N, 3, 64, 64]`` in [-1, 1]."""
@@ -96,7 +97,7 @@ class PaperGenerator(HallucinationGenerator):
         """Add H to images, see ``composition``."""
         if self.composition == "dimming":
             return torch.tanh(images + change)
-        return images + torch.tanh(images + change) - torch.tanh(images)
+        return images + (torch.tanh(images + change) - torch.tanh(images))
 
 
 class Discriminator(nn.Module):
@@ -112,13 +113,13 @@ class Discriminator(nn.Module):
         strides = [first_stride, 2, 2, 2, 2, 2, 2 if first_stride == 1 else 1]
         widths = [3, 32, 32, 32, 64, 64, 64, 128]
         layers: list[nn.Module] = []
-        for inputs, outputs, stride in zip(widths, widths[1:], strides, strict=False):
+        for inputs, outputs, stride in zip(widths[:-1], widths[1:], strides, strict=True):
             layers += [*_same_convolution(inputs, outputs, stride), nn.LeakyReLU(LEAK)]
         self.layers = nn.Sequential(*layers, nn.Flatten())
         self.realism = nn.Linear(128, 1)
         self.configuration = nn.Linear(128, feature_size)
         self.projection = nn.Linear(feature_size, 128) if conditional else None
-        self.to(memory_format=torch.channels_last)
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, images: Tensor, features: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Judge images ``[N, 3, 64, 64]`` in [-1, 1].

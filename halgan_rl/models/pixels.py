@@ -7,7 +7,7 @@ from torch import Tensor
 def to_float(pixels: Tensor) -> Tensor:
     """Scale images to [-1, 1] and move the channels forward.
 
-    A permuted ``HWC`` tensor already lies in memory as ``channels_last``, so nothing is copied but the conversion itself.
+    A permuted ``HWC`` tensor already lies in memory as ``channels_last``: nothing is copied but by the conversion.
 
     Args:
         pixels: uint8 ``[..., H, W, C]``, any leading dimensions, also none.

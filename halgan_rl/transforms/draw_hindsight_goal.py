@@ -25,7 +25,8 @@ class DrawHindsightGoal(ReplayTransform):
         annealing_steps: Frames, as counted by :meth:`step`, from the one to the other.
 
     Keyword Args:
-        generator: The source of all randomness here. With ``prefetch`` its draws are not reproducible.
+        generator: The source of all randomness here. With ``prefetch`` its draws are not reproducible; to
+            ``torch.compile`` a generator is opaque, so compile the transforms after this one.
         tolerance: When a row already stands at its goal; None relabels such rows too.
         pose_key: Pose ``[P]`` of the row.
         hindsight_key: Where :class:`~halgan_rl.transforms.StampFuturePoses` wrote ``"pose"`` and ``"horizon"``.

@@ -15,6 +15,8 @@ class HindsightReward(ReplayTransform):
     ``truncated`` False, all together. Every other row stays as it is, bit for bit: one relabelled but not there yet
     keeps its reward.
 
+    A ``SliceSampler`` writes its own flags over these after the transforms ran: give it ``truncated_key=None``.
+
     Keyword Args:
         success_reward: Added to the row's own reward, which may hold an energy cost.
         tolerance: When a pose is the goal pose.

@@ -32,6 +32,11 @@ def test_probability_zero_relabels_no_row() -> None:
     assert not draw(0.0)(rows(10_000))["goal", "mask"].any()
 
 
+def test_probability_zero_relabels_no_row_even_at_the_lowest_draw(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(DrawHindsightGoal, "_uniform", lambda self, like: torch.zeros(like.shape))
+    assert not draw(0.0)(rows(3))["goal", "mask"].any()
+
+
 def test_probability_one_relabels_every_row_with_a_future() -> None:
     horizon = [0, 1, 2, 0, 8]
     assert draw(1.0)(rows(5, horizon))["goal", "mask"].flatten().tolist() == [False, True, True, False, True]

@@ -202,6 +202,14 @@ def test_after_flush_a_new_episode_may_start_in_mid_episode() -> None:
     assert times(stamp.inv(rows(STEP, STEP, environment=Environment(episode=7)))) == [[1, 2]]
 
 
+def test_after_flush_another_number_of_environments_may_write() -> None:
+    stamp = StampFuturePoses(2)
+    stamp.inv(rows(STEP, STEP))
+    stamp.flush()
+    two = torch.stack([rows(STEP, STEP), rows(STEP, STEP, environment=Environment(1))])
+    assert len(stamp.inv(two)) == 2
+
+
 def test_rows_held_back_do_not_change_when_the_collector_reuses_its_memory() -> None:
     stamp, environment = StampFuturePoses(3), Environment()
     batch = rows(STEP, STEP, environment=environment)

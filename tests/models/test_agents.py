@@ -1,0 +1,75 @@
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from halgan_rl.models.agents import Actor, Critic, Downsample, QNetwork, deterministic_policy
+
+NETWORKS = {"actor": (Actor, 33_642), "critic": (Critic, 33_673), "ddqn": (QNetwork, 33_708)}
+
+
+def frames(*leading: int, seed: int = 0) -> Tensor:
+    rng = torch.Generator().manual_seed(seed)
+    return torch.randint(0, 256, (*leading, 64, 64, 3), dtype=torch.uint8, generator=rng)
+
+
+def call(network: nn.Module, pixels: Tensor) -> Tensor:
+    action = torch.linspace(-1, 1, 2).expand(*pixels.shape[:-3], 2)
+    return network(pixels, action) if isinstance(network, Critic) else network(pixels)
+
+
+@pytest.mark.parametrize("downsample", ["stride", "max_pool"])
+@pytest.mark.parametrize("name", NETWORKS)
+def test_parameters_are_counted_as_in_the_paper(name: str, downsample: Downsample) -> None:
+    network, count = NETWORKS[name]
+    assert sum(p.numel() for p in network(downsample=downsample).parameters()) == count
+
+
+@pytest.mark.parametrize("downsample", ["stride", "max_pool"])
+@pytest.mark.parametrize("name", NETWORKS)
+def test_any_leading_dimensions_give_the_same_values(name: str, downsample: Downsample) -> None:
+    network = NETWORKS[name][0](downsample=downsample)
+    pixels = frames(2, 3)
+    values = call(network, pixels)
+    assert values.shape[:-1] == (2, 3)
+    torch.testing.assert_close(values[1, 2], call(network, pixels[1, 2]))
+    torch.testing.assert_close(values[0], call(network, pixels[0]))
+
+
+def test_weights_and_activations_are_channels_last() -> None:
+    vision = Actor().vision
+    layouts = []
+    for layer in vision.layers:
+        if isinstance(layer, nn.Conv2d):
+            assert layer.weight.is_contiguous(memory_format=torch.channels_last)
+            layer.register_forward_hook(
+                lambda _, __, out: layouts.append(out.is_contiguous(memory_format=torch.channels_last))
+            )
+    vision(frames(2))
+    assert layouts == [True] * 4
+
+
+def test_actions_stay_in_range_and_depend_on_the_image() -> None:
+    torch.manual_seed(0)
+    actor = Actor()
+    nn.init.normal_(actor.head[-1].weight, std=5.0)
+    pixels = TensorDict({"pixels": frames(8)}, batch_size=[8])
+    actions = deterministic_policy(actor)(pixels)["action"]
+    assert actions.abs().max() <= 1
+    assert actions.std(0).min() > 0
+
+
+def test_the_critic_hears_of_the_action() -> None:
+    critic, pixels = Critic(), frames(1)
+    assert not torch.equal(critic(pixels, torch.tensor([[1.0, 0.0]])), critic(pixels, torch.tensor([[0.0, 1.0]])))
+
+
+@pytest.mark.parametrize("pixels", [torch.zeros(2, 3, 64, 64, dtype=torch.uint8), torch.zeros(2, 64, 64, 3)])
+def test_images_of_another_layout_or_type_are_refused(pixels: Tensor) -> None:
+    with pytest.raises(ValueError, match="pixels must be uint8"):
+        Actor()(pixels)
+
+
+def test_an_unknown_downsampling_is_refused() -> None:
+    with pytest.raises(ValueError, match="average"):
+        Actor(downsample="average")  # type: ignore[arg-type]

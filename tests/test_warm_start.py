@@ -1,0 +1,55 @@
+import torch
+from torch import Tensor
+
+from halgan_rl.models.coordinates import CoordinateGenerator
+from halgan_rl.models.pixels import to_float, to_uint8
+from halgan_rl.warm_start import colour_index, goal_colours, warm_start
+from tests import synthetic
+
+
+def train(steps: int, seed: int = 0) -> tuple[CoordinateGenerator, list[float]]:
+    torch.manual_seed(0)
+    data = synthetic.near_goal(256)
+    generator = CoordinateGenerator()
+    generator.encoding.standardise(generator.encoding.labels(data["pose"], data["goal_pose"]))
+    rng = torch.Generator().manual_seed(seed)
+    losses = warm_start(
+        generator, near_goal=data, failed_pixels=synthetic.failed(), steps=steps, rng=rng, batch_size=64, pixels=256
+    )
+    return generator, list(losses)
+
+
+def paint(generator: CoordinateGenerator, relative_pose: list[float]) -> Tensor:
+    """Return what is painted into a black frame."""
+    features = generator.encoding(torch.tensor([relative_pose]))
+    with torch.no_grad():
+        change = generator(features, torch.zeros(1, generator.latent_size))
+    return to_uint8(generator.compose(to_float(torch.zeros(1, 64, 64, 3, dtype=torch.uint8)), change))[0].float()
+
+
+def test_the_goal_is_painted_in_its_colour_where_the_relative_pose_has_it() -> None:
+    generator, losses = train(100)
+    assert losses[-1] < losses[0] / 5
+    left, right = (paint(generator, [0.3, y, 0.0]) for y in (0.08, -0.08))
+    assert left[32, 27, 0] > 120 > 40 > left[32, 27, 1]  # column 32 - 60 y
+    assert right[32, 37, 0] > 120 > 40 > right[32, 37, 1]
+    assert left[:8].max() < 20
+    near, far = (paint(generator, [x, 0.0, 0.0])[..., 0].sum() for x in (0.1, 0.7))
+    assert near > 2 * far
+
+
+def test_equal_seeds_give_equal_weights() -> None:
+    one, same, other = (train(3, seed)[0].state_dict() for seed in (0, 0, 1))
+    assert all(torch.equal(one[name], same[name]) for name in one)
+    assert not torch.equal(one["paint.0.weight"], other["paint.0.weight"])
+
+
+def test_the_goals_colours_are_those_that_failed_frames_lack() -> None:
+    is_goal = goal_colours(synthetic.near_goal()["pixels"], synthetic.failed())
+    colours = torch.tensor([[200, 20, 20], [120, 120, 120], [20, 200, 20]], dtype=torch.uint8)
+    assert is_goal[colour_index(colours)].tolist() == [True, False, False]
+
+
+def test_colours_are_told_apart_by_channel() -> None:
+    colours = torch.tensor([[255, 0, 0], [0, 255, 0], [0, 0, 255], [0, 0, 15]], dtype=torch.uint8)
+    assert colour_index(colours).tolist() == [15 * 256, 15 * 16, 15, 0]
