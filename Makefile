@@ -30,11 +30,13 @@ bench: $(VENV)/ready  ## speed, side by side with the stock camera
 	$(BIN)/python benchmarks/env_speed.py
 	$(BIN)/python benchmarks/update_cost.py
 
-weights: $(VENV)/ready  ## train the shipped generators again (about an hour)
+weights: $(VENV)/ready  ## train the shipped generators again (a few minutes)
 	for environment in navigate-2m navigate-4m; do \
-	  $(BIN)/python recipes/train_halgan.py --environment $$environment --seed 0 --out runs/weights-$$environment && \
-	  for suffix in safetensors json png; do \
-	    cp runs/weights-$$environment/generator.$$suffix halgan_rl/shipped/$$environment.$$suffix; done; done
+	  run=runs/weights-$$environment shipped=halgan_rl/shipped/$$environment; \
+	  $(BIN)/python recipes/train_halgan.py --environment $$environment --seed 0 --out $$run && \
+	  cp $$run/generator.safetensors $$shipped.safetensors && \
+	  cp $$run/generator.json $$shipped.json && \
+	  cp $$run/hallucinations.png $$shipped.png || exit 1; done
 
 $(VENV)/ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)

@@ -27,6 +27,7 @@ def halgan(
     probability: float = 0.3,
     final_probability: float = 0.0,
     annealing_steps: int = 60_000,
+    nearness: float = 1.0,
     tolerance: PoseTolerance = PoseTolerance(),  # noqa: B008 (frozen)
     success_reward: float = 1.0,
     fixed_shape: bool = False,
@@ -48,6 +49,7 @@ def halgan(
         probability: Share of sampled rows to relabel at first, in [0, 1].
         final_probability: That share after ``annealing_steps`` frames.
         annealing_steps: Frames from the one share to the other, counted by ``pipeline[1].step(frames)``.
+        nearness: Preference for near goals; 1 draws them uniformly, as the paper does.
         tolerance: When a pose is the goal pose.
         success_reward: Added to the reward of a relabelled row that reaches its goal.
         fixed_shape: Whether to hallucinate all rows, so that no shape depends on the data.
@@ -80,6 +82,7 @@ def halgan(
             final_probability,
             annealing_steps,
             generator=generator,
+            nearness=nearness,
             tolerance=tolerance,
             pose_key=pose_key,
             hindsight_key=hindsight_key,

@@ -3,11 +3,11 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.objectives import DDPGLoss
 
-from halgan_rl.objectives import ClippedTD0Estimator
+from halgan_rl.objectives import ClippedTD0Estimator, UnsaturatedDDPGLoss
 
 
 class Sum(nn.Module):
@@ -60,3 +60,46 @@ def test_targets_are_clipped_and_inner_ones_kept() -> None:
 def test_bounds_in_the_wrong_order_are_refused() -> None:
     with pytest.raises(ValueError, match=r"low=1.0 must be below high=-1.0"):
         ClippedTD0Estimator(low=1.0, high=-1.0, gamma=0.5, value_network=make_loss().actor_critic)
+
+
+def make_unsaturated(weight: float) -> UnsaturatedDDPGLoss:
+    """An actor whose pre-activation is far out (3), before a critic that asks for more."""
+    linear = nn.Linear(1, 1)
+    nn.init.zeros_(linear.weight)
+    nn.init.constant_(linear.bias, 3.0)
+    actor = TensorDictSequential(
+        TensorDictModule(linear, in_keys=["observation"], out_keys=["preactivation"]),
+        TensorDictModule(nn.Tanh(), in_keys=["preactivation"], out_keys=["action"]),
+    )
+    critic = TensorDictModule(Sum(1.0), in_keys=["observation", "action"], out_keys=["state_action_value"])
+    loss = UnsaturatedDDPGLoss(actor, critic, delay_actor=True, delay_value=True, preactivation_weight=weight)
+    loss.make_value_estimator(gamma=0.5)
+    return loss
+
+
+def test_the_price_is_the_weighted_square_of_the_preactivation() -> None:
+    free, priced = (make_unsaturated(weight)(make_batch())["loss_actor"] for weight in (0.0, 0.1))
+    torch.testing.assert_close(free, torch.tensor(-3.0).tanh())
+    torch.testing.assert_close(priced - free, torch.tensor(0.1 * 9))
+
+
+def test_the_price_leads_out_of_saturation_and_never_reaches_the_critic() -> None:
+    for weight, sign in ((0.0, -1), (0.1, 1)):
+        loss = make_unsaturated(weight)
+        loss(make_batch())["loss_actor"].backward()
+        assert loss.actor_network_params["module", "0", "module", "bias"].grad.sign().item() == sign
+        assert all(parameter.grad is None for parameter in loss.value_network_params.values(True, True))
+
+
+def test_weight_zero_is_torchrls_own_loss() -> None:
+    ours = make_unsaturated(0.0)
+    theirs = DDPGLoss(ours.actor_network, ours.value_network, delay_actor=True, delay_value=True)
+    theirs.make_value_estimator(gamma=0.5)
+    theirs.load_state_dict(ours.state_dict())
+    for name in ("loss_actor", "loss_value"):
+        torch.testing.assert_close(ours(make_batch())[name], theirs(make_batch())[name])
+
+
+def test_a_negative_price_is_refused() -> None:
+    with pytest.raises(ValueError, match="must not be negative, got -1"):
+        make_unsaturated(-1.0)

@@ -37,7 +37,6 @@ class Vision(nn.Module):
             layers += [nn.Conv2d(inputs, outputs, 5, stride=1 if pooled else 2, padding=2), nn.LeakyReLU(LEAK)]
             layers += [nn.MaxPool2d(2)] if pooled else []
         self.layers = nn.Sequential(*layers, nn.Flatten())
-        self.apply(_initialise)
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, pixels: Tensor) -> Tensor:
@@ -138,17 +137,4 @@ class QNetwork(nn.Module):
 
 
 def _head(inputs: int, outputs: int) -> nn.Sequential:
-    head = nn.Sequential(nn.Linear(inputs, _HIDDEN_SIZE), nn.LeakyReLU(LEAK), nn.Linear(_HIDDEN_SIZE, outputs))
-    return head.apply(_initialise)
-
-
-def _initialise(layer: nn.Module) -> None:
-    """Start a layer as Keras does, which the authors used: Glorot's uniform weights, no bias.
-
-    PyTorch's own weights are about half as large a layer: behind six of them, one image gives almost the same features
-    as another, and the actor learns one action for all before it learns to tell them apart.
-    """
-    if isinstance(layer, nn.Conv2d | nn.Linear):
-        nn.init.xavier_uniform_(layer.weight)
-        if layer.bias is not None:
-            nn.init.zeros_(layer.bias)
+    return nn.Sequential(nn.Linear(inputs, _HIDDEN_SIZE), nn.LeakyReLU(LEAK), nn.Linear(_HIDDEN_SIZE, outputs))

@@ -56,6 +56,20 @@ def test_the_offset_is_uniform_on_one_to_the_horizon(horizon: int) -> None:
     assert (count - expected).abs().max() <= 4 * math.sqrt(20_000 * share * (1 - share))
 
 
+@pytest.mark.parametrize("nearness", [1.5, 2.0, 4.0])
+def test_nearness_raises_the_share_of_near_goals(nearness: float) -> None:
+    count = torch.bincount(offsets(draw(nearness=nearness)(rows(20_000))), minlength=STEPS + 1)[1:]
+    edges = (torch.arange(STEPS + 1) / STEPS) ** (1 / nearness)
+    expected = 20_000 * edges.diff()
+    assert (count - expected).abs().max() <= 4 * expected.max().sqrt()
+
+
+@pytest.mark.parametrize("nearness", [0.5, float("nan")])
+def test_a_preference_for_far_goals_is_refused(nearness: float) -> None:
+    with pytest.raises(ValueError, match="nearness must be at least 1"):
+        draw(nearness=nearness)
+
+
 def test_whether_and_where_are_drawn_independently() -> None:
     out = draw(0.5)(rows(20_000))
     relabelled = offsets(out)[out["goal", "mask"].flatten()].float()

@@ -10,7 +10,17 @@ from torchrl.envs import Compose, StepCounter, TransformedEnv
 
 from halgan_rl import transforms
 from tests.toy import Parking
-from tests.transforms.rows import CASES, RENAMED, SAMPLING, Case, assert_identical, leaves, rename, sampled_rows
+from tests.transforms.rows import (
+    CASES,
+    RELABELLING,
+    RENAMED,
+    SAMPLING,
+    Case,
+    assert_identical,
+    leaves,
+    rename,
+    sampled_rows,
+)
 
 EVERY = pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
 ON_SAMPLING = pytest.mark.parametrize("case", SAMPLING.values(), ids=SAMPLING.keys())
@@ -105,7 +115,7 @@ def test_only_the_entries_named_are_written(case: Case) -> None:
     assert all(not torch.equal(out[key], rows[key]) for key in case.writes)
 
 
-@ON_SAMPLING
+@pytest.mark.parametrize("case", RELABELLING.values(), ids=RELABELLING.keys())
 def test_unmasked_rows_are_untouched_bit_for_bit(case: Case) -> None:
     rows = rows_for(case)
     out = case.make()(rows)
