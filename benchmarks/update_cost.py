@@ -24,7 +24,7 @@ from recipes.ddpg_navigate import (
     Config,
     make_agent,
     make_hallucinator,
-    make_transform,
+    make_hindsight,
     make_loss,
     make_optimizer,
     update,
@@ -50,7 +50,7 @@ def make_update(config: Config, rollout: TensorDict) -> Callable[[], object]:
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(len(rollout)),
         batch_size=config.batch_size,
-        transform=make_transform(config, make_hallucinator(config)),
+        transform=make_hindsight(config, make_hallucinator(config)),
         generator=torch.Generator().manual_seed(0),
     )
     buffer.extend(rollout.clone())

@@ -4,14 +4,12 @@ from halgan_rl.transforms.base import ReplayTransform
 from halgan_rl.transforms.draw_hindsight_goal import DrawHindsightGoal
 from halgan_rl.transforms.hallucinate_goal import HallucinateGoal
 from halgan_rl.transforms.hindsight_reward import HindsightReward
-from halgan_rl.transforms.mirror_rows import MirrorRows
 from halgan_rl.transforms.stamp_future_poses import StampFuturePoses
 
 __all__ = [
     "DrawHindsightGoal",
     "HallucinateGoal",
     "HindsightReward",
-    "MirrorRows",
     "ReplayTransform",
     "StampFuturePoses",
 ]

@@ -14,7 +14,8 @@ class DrawHindsightGoal(ReplayTransform):
     """Draws, for each sampled row, whether it is relabelled and which later pose of its episode becomes its goal.
 
     **Core rule.** A row is relabelled with the given probability, towards the pose d steps later, d uniform in
-    1 ... horizon (or nearer, see ``nearness``). It never is if its horizon is 0, or if it already stands at the goal drawn.
+    1 ... horizon (or nearer, see ``nearness``). It never is if its horizon is 0, or if it already stands at the goal
+    drawn.
 
     The probability is annealed linearly, as in :class:`torchrl.modules.EGreedyModule`: call :meth:`step` with the
     number of frames collected. It and the generator's state are part of ``state_dict()``.
@@ -27,8 +28,8 @@ class DrawHindsightGoal(ReplayTransform):
     Keyword Args:
         generator: The source of all randomness here. With ``prefetch`` its draws are not reproducible; to
             ``torch.compile`` a generator is opaque, so compile the transforms after this one.
-        nearness: Preference k >= 1 for near goals: d is 1 + floor(horizon * u^k), u uniform in [0, 1). 1 is uniform, as in
-            the paper; with 2 and a horizon of 32, the next pose is the goal 6 times as often.
+        nearness: Preference k >= 1 for near goals: d is 1 + floor(horizon * u^k), u uniform in [0, 1). 1 is uniform, as
+            in the paper; with 2 and a horizon of 32, the next pose is the goal 6 times as often.
         tolerance: When a row already stands at its goal; None relabels such rows too.
         pose_key: Pose ``[P]`` of the row.
         hindsight_key: Where :class:`~halgan_rl.transforms.StampFuturePoses` wrote ``"pose"`` and ``"horizon"``.

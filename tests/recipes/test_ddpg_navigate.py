@@ -16,10 +16,12 @@ TINY = dataclasses.replace(
     Config(),
     total_frames=160,
     warmup_frames=64,
+    max_distance=32,
     batch_size=8,
     replay_capacity=200,
     evaluate_every=80,
     evaluation_starts=1,
+    film_starts=1,
 )
 
 

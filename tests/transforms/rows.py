@@ -11,14 +11,12 @@ from halgan_rl.transforms import (
     DrawHindsightGoal,
     HallucinateGoal,
     HindsightReward,
-    MirrorRows,
     ReplayTransform,
     StampFuturePoses,
 )
 
 DISTANCE = 4
 RENAMED: dict[str, NestedKey] = {
-    "action": ("robot", "action"),
     "pixels": ("camera", "pixels"),
     "pose": ("robot", "body", "pose"),
     "reward": ("robot", "reward"),
@@ -190,11 +188,5 @@ CASES = {
         },
         (("next", "reward"), ("next", "done"), ("next", "terminated"), ("next", "truncated")),
     ),
-    "MirrorRows": Case(
-        lambda **keys: MirrorRows(0.5, generator=random_source(), **keys),
-        {"pixels_key": ("pixels", ("next", "pixels")), "action_key": ("action",)},
-        ("pixels", ("next", "pixels"), "action"),
-    ),
 }
 SAMPLING = {name: case for name, case in CASES.items() if not case.on_write}
-RELABELLING = {name: case for name, case in SAMPLING.items() if name != "MirrorRows"}

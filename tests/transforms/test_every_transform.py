@@ -12,7 +12,6 @@ from halgan_rl import transforms
 from tests.toy import Parking
 from tests.transforms.rows import (
     CASES,
-    RELABELLING,
     RENAMED,
     SAMPLING,
     Case,
@@ -115,7 +114,7 @@ def test_only_the_entries_named_are_written(case: Case) -> None:
     assert all(not torch.equal(out[key], rows[key]) for key in case.writes)
 
 
-@pytest.mark.parametrize("case", RELABELLING.values(), ids=RELABELLING.keys())
+@ON_SAMPLING
 def test_unmasked_rows_are_untouched_bit_for_bit(case: Case) -> None:
     rows = rows_for(case)
     out = case.make()(rows)
