@@ -28,7 +28,7 @@ format: $(VENV)/ready
 
 bench: $(VENV)/ready  ## speed, side by side with the stock camera
 	$(BIN)/python benchmarks/env_speed.py
-	$(BIN)/python benchmarks/update_cost.py
+	$(BIN)/python -m benchmarks.update_cost
 
 weights: $(VENV)/ready  ## train the shipped generators again (a few minutes)
 	for environment in navigate-2m navigate-4m; do \

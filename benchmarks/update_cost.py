@@ -2,7 +2,7 @@
 
 Usage::
 
-    python benchmarks/update_cost.py                 # one thread, the recipe's batch of 64
+    python -m benchmarks.update_cost   # one thread, the recipe's batch of 64
 
 Times one update of the recipe (sample, loss, backward, both optimizer steps, target update) with no hindsight, with
 HALGAN and with the simulator as oracle, at the share of relabelled rows that the recipe starts from and at its mean
