@@ -455,10 +455,11 @@ def draw_pictures(
 
 
 def draw_hallucinations(path: Path, config: Config, buffer: TensorDictReplayBuffer, *, title: str) -> None:
-    """Draw replayed rows: the frame as it was, its goal truly rendered, and as the agent is shown it."""
-    rows = buffer[torch.linspace(0, len(buffer) - 1, 200).long()]
-    rows = rows[rows["hindsight", "horizon"].squeeze(-1) == config.max_distance][:12]
-    goal = rows["hindsight", "pose"][:, [config.max_distance // 2]]
+    """Draw stored rows: the frame as it was, a goal some steps ahead truly rendered, and as the agent is shown it."""
+    steps = min(12, config.max_distance)
+    rows = buffer.storage[torch.linspace(0, len(buffer) - 1, 200).long()]  # past the transform, which would relabel
+    rows = rows[rows["hindsight", "horizon"].squeeze(-1) >= steps][::16]
+    goal = rows["hindsight", "pose"][:, [steps - 1]]
     frames, poses = rows["pixels"].unsqueeze(1), rows["pose"].unsqueeze(1)
     painters = {"true goal": GoalRenderer(config.environment), config.hindsight: make_hallucinator(config)}
     painted = {label: painter(frames, poses, goal).squeeze(1) for label, painter in painters.items()}
