@@ -1,0 +1,20 @@
+"""The claim of the whole library, on the real environment; about twenty minutes. `make test-slow` runs it."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from halgan_rl.run_folder import read_metrics
+from recipes.ddpg_navigate import Config, main
+
+
+def success_rates(out: Path, hindsight: str) -> list[float]:
+    main(dataclasses.replace(Config(), hindsight=hindsight, total_frames=24_000, out=out, film_starts=1))
+    return read_metrics(out / "metrics.csv")["eval/success_rate"]
+
+
+@pytest.mark.slow
+def test_an_agent_learns_with_hallucinations_and_not_without(tmp_path: Path) -> None:
+    assert max(success_rates(tmp_path / "halgan", "halgan")) >= 0.8
+    assert max(success_rates(tmp_path / "none", "none")) <= 0.05
