@@ -1,4 +1,4 @@
-"""GoalRenderer: the simulator as a hallucinator, the upper bound that no generative model can beat."""
+"""GoalRenderer: the simulator as a hallucinator, whose pictures no generative model can beat."""
 
 import mujoco
 import numpy as np

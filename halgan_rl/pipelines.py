@@ -109,7 +109,7 @@ def halgan(
 
 
 def oracle(renderer: Hallucinator, **options: Any) -> Compose:
-    """The upper bound that no GAN can beat: :func:`halgan` with the goal rendered by the simulator itself.
+    """Perfect hallucinations: :func:`halgan` with the goal rendered by the simulator itself.
 
     Args:
         renderer: Renders what is seen from each pose with the goal moved to where hindsight puts it.

@@ -3,7 +3,7 @@
 Usage::
 
     python recipes/ddpg_navigate.py                                   # HALGAN, 2 m room, shipped weights
-    python recipes/ddpg_navigate.py --hindsight oracle --seed 1       # the simulator paints the goal: upper bound
+    python recipes/ddpg_navigate.py --hindsight oracle --seed 1       # the simulator itself paints the goal
     python recipes/ddpg_navigate.py --hindsight none                  # plain DDPG: never sees a reward
     python recipes/ddpg_navigate.py --preset paper                    # the paper's appendix, in its 4 m room
 
