@@ -15,10 +15,11 @@ from envs.golden import fingerprint
 from envs.names import NAMES, named
 from envs.navigate import navigate_2m, navigate_4m
 from envs.near_goal import collect_failed, collect_near_goal
-from envs.oracle import GoalRenderer
+from envs.oracle import GOAL_OFFSET, GoalRenderer
 from envs.torchrl_env import ComposerEnv
 
 __all__ = [
+    "GOAL_OFFSET",
     "NAMES",
     "ComposerEnv",
     "Environment",

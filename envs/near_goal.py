@@ -19,6 +19,8 @@ _FAR_NOISE = 0.2
 """Share of random actions there."""
 _NOISE = (0.6, 1.0)
 """Lowest and highest share of random actions near the box: the snippets that hindsight relabels are wandering ones."""
+_HOLD = 8
+"""Steps that a random action of a failed episode lasts."""
 
 
 class NoisyDriver:
@@ -56,10 +58,9 @@ class NoisyDriver:
     def _steer(self, ahead: float, left: float) -> np.ndarray:
         task = self._environment.task
         bearing = np.arctan2(left, ahead)
-        turn = bearing / (task.rover.max_turn_rate * task.control_timestep)
         gap = np.hypot(ahead, left) - 0.9 * task.success_distance
-        forward = gap / (task.rover.max_speed * task.control_timestep) if abs(bearing) < 0.5 else 0.0
-        return np.clip([forward, turn], -1.0, 1.0)
+        speed = gap / task.control_timestep if abs(bearing) < 0.5 else 0.0
+        return task.rover.action_for(max(speed, 0.0), bearing / task.control_timestep)
 
 
 def collect_near_goal(
@@ -110,6 +111,7 @@ def collect_near_goal(
 def collect_failed(environment: Environment, count: int, random_state: np.random.RandomState) -> dict[str, np.ndarray]:
     """Collects snapshots of episodes with uniformly random actions that do not succeed.
 
+    Each action is held for a while: turns that are drawn anew at each step average out, and all walks end at a wall.
     The box may be in view: nobody looks.
 
     Args:
@@ -145,7 +147,9 @@ def _wander(environment: Environment, random_state: np.random.RandomState) -> tu
     timestep = environment.reset()
     episode = [_snapshot(timestep)]
     while not timestep.last():
-        timestep = environment.step(random_state.uniform(-1, 1, size=2))
+        if (len(episode) - 1) % _HOLD == 0:
+            action = random_state.uniform(-1, 1, size=2)
+        timestep = environment.step(action)
         episode.append(_snapshot(timestep))
     return episode, timestep.discount == 0.0
 

@@ -58,6 +58,15 @@ class GoalRenderer:
         images = np.stack(frames) if frames else np.empty((0, *pixels.shape[-3:]), np.uint8)
         return torch.from_numpy(images).reshape(pixels.shape).to(pixels.device)
 
+    def is_possible(self, goal_pose: Tensor) -> Tensor:
+        """Tells which poses float [..., P] a goal can be reached from, bool [...].
+
+        A robot that faces a wall before it has reached no box: the task puts none into walls.
+        """
+        x, y, yaw = goal_pose[..., :3].unbind(-1)
+        ahead = torch.stack([x + self._goal_offset * yaw.cos(), y + self._goal_offset * yaw.sin()], -1)
+        return (ahead.abs() <= self._environment.task.box_range).all(-1)
+
     def box_position(self, goal_pose: np.ndarray) -> np.ndarray:
         """Where the box stands, x, y [m], for a robot that has reached it at goal_pose [3]."""
         x, y, yaw = goal_pose[:3]

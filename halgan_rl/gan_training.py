@@ -114,15 +114,15 @@ class HalganTrainer:
         settings = self.settings
         real, features = self._draw_real()
         with torch.no_grad():
-            _, fake_features, fake = self._draw_fake()
-        real_score, guess = self.discriminator(real, features)
-        fake_score, _ = self.discriminator(fake, fake_features)
+            _, _, fake = self._draw_fake()
+        real_score, guess = self.discriminator(real)
+        fake_score, _ = self.discriminator(fake)
         distance = real_score.mean() - fake_score.mean()
         auxiliary = nn.functional.mse_loss(guess, features)
         loss = settings.auxiliary_weight * auxiliary - distance
         if self._penalty_countdown == 0:
             self._penalty_countdown = settings.penalty_interval
-            penalty = self._gradient_penalty(real, fake, features, fake_features)
+            penalty = self._gradient_penalty(real, fake)
             loss = loss + settings.penalty_interval * settings.penalty_weight * penalty
         self._penalty_countdown -= 1
         _descend(self._discriminator_optimizer, loss)
@@ -132,18 +132,18 @@ class HalganTrainer:
         """Please the critic, show the goal at its configuration, and change little."""
         settings = self.settings
         images, features, fake = self._draw_fake()
-        score, guess = self.discriminator(fake, features)
+        score, guess = self.discriminator(fake)
         auxiliary = nn.functional.mse_loss(guess, features)
         change = (fake - images).square().mean()
         loss = settings.auxiliary_weight * auxiliary + settings.change_weight * change - score.mean()
         _descend(self._generator_optimizer, loss)
         return {"auxiliary_fake": auxiliary.detach(), "change": change.detach()}
 
-    def _gradient_penalty(self, real: Tensor, fake: Tensor, features: Tensor, fake_features: Tensor) -> Tensor:
+    def _gradient_penalty(self, real: Tensor, fake: Tensor) -> Tensor:
         """Return the mean square deviation from 1 of the critic's slope between real and fake images."""
         mix = torch.rand(len(real), 1, 1, 1, generator=self.rng)
         between = torch.lerp(real, fake, mix).requires_grad_()
-        score, _ = self.discriminator(between, torch.lerp(features, fake_features, mix[:, :, 0, 0]))
+        score, _ = self.discriminator(between)
         (slope,) = torch.autograd.grad(score.sum(), between, create_graph=True)
         return (slope.flatten(1).norm(dim=1) - 1).square().mean()
 

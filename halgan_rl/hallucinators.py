@@ -25,6 +25,13 @@ class Hallucinator(Protocol):
         """
 
 
+class Renderer(Hallucinator, Protocol):
+    """A hallucinator that knows the truth: a simulator."""
+
+    def is_possible(self, goal_pose: Tensor) -> Tensor:
+        """Tell from which poses ``[..., P]`` a goal could be reached at all, bool ``[...]``."""
+
+
 class GanHallucinator:
     """Paints goals with a trained generator.
 
@@ -46,7 +53,7 @@ class GanHallucinator:
     @torch.no_grad()
     def __call__(self, pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
         """Paint the goals, see :class:`Hallucinator`."""
-        self._check(pose, goal_pose)
+        check_poses(int(self._generator.arguments["pose_size"]), pose=pose, goal_pose=goal_pose)
         rows, frames = pixels.shape[:2]
         features = self._generator.encoding(self._generator.encoding.labels(pose, goal_pose)).flatten(0, 1)
         latent = self._generator.sample_latent(rows, self._rng).repeat_interleave(frames, 0)
@@ -60,13 +67,18 @@ class GanHallucinator:
     def _paint(self, pixels: Tensor, features: Tensor, latent: Tensor) -> Tensor:
         return to_uint8(self._generator.compose(to_float(pixels), self._generator(features, latent)))
 
-    def _check(self, pose: Tensor, goal_pose: Tensor) -> None:
-        size = self._generator.arguments["pose_size"]
-        for name, value in (("pose", pose), ("goal_pose", goal_pose)):
-            if value.shape[-1] != size:
-                raise ValueError(
-                    f"{name} has {value.shape[-1]} entries, but the generator was trained with {size}: "
-                    "use weights of an environment with such poses"
-                )
-            if not value.isfinite().all():
-                raise ValueError(f"{name} holds NaN or infinity: look for it in the rows of the replay buffer")
+
+def check_poses(size: int, **poses: Tensor) -> None:
+    """Refuse poses that a generator trained on poses of ``size`` entries cannot know.
+
+    Raises:
+        ValueError: if poses have another size or are not finite; names them.
+    """
+    for name, value in poses.items():
+        if value.shape[-1] != size:
+            raise ValueError(
+                f"{name} has {value.shape[-1]} entries, but the generator was trained with {size}: "
+                "use weights of an environment with such poses"
+            )
+        if not value.isfinite().all():
+            raise ValueError(f"{name} holds NaN or infinity: look for it in the rows of the replay buffer")

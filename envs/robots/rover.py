@@ -29,7 +29,7 @@ class Rover(composer.Entity):
         mass: [kg].
         max_speed: Forward speed at action +1 [m/s].
         reverse_speed: Backward speed at action -1 [m/s]. By default 0, no reverse gear: a robot that sees only what is
-            ahead would back through goals that hindsight puts behind it. Action 0 is rest either way.
+            ahead would back through goals that hindsight puts behind it. Action 0 is then half speed.
         max_turn_rate: Turn rate at action +1, to the left [rad/s].
         camera_height: [m].
         camera_pitch: How far the camera looks down [rad].
@@ -142,10 +142,21 @@ class Rover(composer.Entity):
         self.camera = None
 
     def apply_action(self, physics: Any, action: np.ndarray, random_state: np.random.RandomState) -> None:
-        """Sets the servos: action -1 ... 0 ... +1 is backward, rest, forward, and right, none, left."""
+        """Sets the servos to what :meth:`velocities` tells."""
         del random_state
-        speed = float(action[0]) * (self.max_speed if action[0] > 0 else self.reverse_speed)
-        physics.data.ptr.ctrl[self._ctrl] = speed, 0.0, float(action[1]) * self.max_turn_rate
+        speed, turn_rate = self.velocities(action)
+        physics.data.ptr.ctrl[self._ctrl] = speed, 0.0, turn_rate
+
+    def velocities(self, action: np.ndarray) -> tuple[float, float]:
+        """What an action [2] in [-1, 1] asks for: forward speed [m/s] and turn rate [rad/s], both linear in it."""
+        throttle = (float(action[0]) + 1) / 2
+        speed = throttle * self.max_speed - (1 - throttle) * self.reverse_speed
+        return speed, float(action[1]) * self.max_turn_rate
+
+    def action_for(self, speed: float, turn_rate: float) -> np.ndarray:
+        """The action [2] that asks for a forward speed [m/s] and a turn rate [rad/s], the nearest there is."""
+        forward = 2 * (speed + self.reverse_speed) / (self.max_speed + self.reverse_speed) - 1
+        return np.clip([forward, turn_rate / self.max_turn_rate], -1.0, 1.0)
 
     def pose(self, physics: Any) -> np.ndarray:
         """Where the robot is: x [m], y [m], yaw [rad] in (-pi, pi], float64 [3], in the world frame."""

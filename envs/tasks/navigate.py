@@ -28,7 +28,8 @@ class Navigate(composer.Task):
         min_start_distance: Between robot and box at the start of an episode [m].
         success_distance: [m].
         centring_tolerance: [m].
-        energy_cost: Subtracted from the reward for each unit of the action's Euclidean norm, each step.
+        energy_cost: Subtracted from the reward for each unit of the Euclidean norm of speed and turn rate, in units of
+            the robot's largest ones, each step.
         success_reward: Reward of the step that succeeds.
         control_timestep: Seconds a step.
         physics_timestep: Seconds a physics substep.
@@ -88,8 +89,8 @@ class Navigate(composer.Task):
             )
 
     def _check_room(self) -> None:
-        farthest = np.sqrt(2) * (max(self._robot_range, 0) + max(self._box_range, 0))
-        if min(self._robot_range, self._box_range) <= 0 or self.min_start_distance > 0.75 * farthest:
+        farthest = np.sqrt(2) * (max(self._robot_range, 0) + max(self.box_range, 0))
+        if min(self._robot_range, self.box_range) <= 0 or self.min_start_distance > 0.75 * farthest:
             raise ValueError(
                 f"A room of {self.arena.size} m is too small for min_start_distance={self.min_start_distance} m: "
                 "use a larger room or a smaller distance."
@@ -101,8 +102,8 @@ class Navigate(composer.Task):
         return self.arena.size / 2 - self.rover.radius - _WALL_CLEARANCE
 
     @property
-    def _box_range(self) -> float:
-        # Far enough from the walls that the robot can stand before any side of it.
+    def box_range(self) -> float:
+        """Largest |x| and |y| of the box [m]: the robot can stand before any side of it."""
         return self.arena.size / 2 - self.success_distance - self.rover.radius
 
     @property
@@ -131,7 +132,7 @@ class Navigate(composer.Task):
         """
         for _ in range(_MAX_DRAWS):
             robot = random_state.uniform(-self._robot_range, self._robot_range, size=2)
-            box = random_state.uniform(-self._box_range, self._box_range, size=2)
+            box = random_state.uniform(-self.box_range, self.box_range, size=2)
             if np.hypot(*(robot - box)) >= self.min_start_distance:
                 return np.array([*robot, random_state.uniform(-np.pi, np.pi)]), box
         raise composer.EpisodeInitializationError(
@@ -142,7 +143,8 @@ class Navigate(composer.Task):
     def before_step(self, physics: Any, action: np.ndarray, random_state: np.random.RandomState) -> None:
         """Sets the servos."""
         self.rover.apply_action(physics, action, random_state)
-        self._energy = float(np.hypot(action[0], action[1]))
+        speed, turn_rate = self.rover.velocities(action)
+        self._energy = float(np.hypot(speed / self.rover.max_speed, turn_rate / self.rover.max_turn_rate))
 
     def after_step(self, physics: Any, random_state: np.random.RandomState) -> None:
         """Notes whether the goal is reached."""

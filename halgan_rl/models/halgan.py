@@ -108,7 +108,7 @@ class Discriminator(nn.Module):
         first_stride: 1 as in the paper; 2 costs about a quarter of the arithmetic, with the same parameters.
     """
 
-    def __init__(self, feature_size: int = 2, first_stride: Literal[1, 2] = 1, conditional: bool = False) -> None:
+    def __init__(self, feature_size: int = 2, first_stride: Literal[1, 2] = 1) -> None:
         super().__init__()
         strides = [first_stride, 2, 2, 2, 2, 2, 2 if first_stride == 1 else 1]
         widths = [3, 32, 32, 32, 64, 64, 64, 128]
@@ -118,20 +118,16 @@ class Discriminator(nn.Module):
         self.layers = nn.Sequential(*layers, nn.Flatten())
         self.realism = nn.Linear(128, 1)
         self.configuration = nn.Linear(128, feature_size)
-        self.projection = nn.Linear(feature_size, 128) if conditional else None
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
-    def forward(self, images: Tensor, features: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Judge images ``[N, 3, 64, 64]`` in [-1, 1].
 
         Returns:
             The critic's score ``[N]`` and the regressed features ``[N, K]``.
         """
         hidden = self.layers(images)
-        score = self.realism(hidden).squeeze(-1)
-        if self.projection is not None and features is not None:
-            score = score + (self.projection(features) * hidden).sum(-1)
-        return score, self.configuration(hidden)
+        return self.realism(hidden).squeeze(-1), self.configuration(hidden)
 
 
 def _same_convolution(inputs: int, outputs: int, stride: int = 1) -> list[nn.Module]:

@@ -30,7 +30,8 @@ class Stage:
         mujoco.mj_forward(self.physics.model.ptr, self.physics.data.ptr)
 
     def step(self, forward: float = 0.0, turn: float = 0.0) -> Any:
-        return self.environment.step(np.array([forward, turn]))
+        """Steps at a share of the full speed and a share of the full turn rate."""
+        return self.environment.step(np.array([2 * forward - 1, turn]))
 
     def pose(self) -> np.ndarray:
         return self.rover.pose(self.physics)

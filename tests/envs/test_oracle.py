@@ -96,3 +96,23 @@ def test_a_fingerprint_tells_rooms_apart_and_repeats():
     assert first["golden_frame"] != other["golden_frame"]
     assert set(first) == {"environment", "mujoco", "gl", "golden_frame"}
     assert len(first["golden_frame"]) == 64
+
+
+def test_a_goal_is_possible_where_the_task_could_put_the_box(renderer, room_2m):
+    reach = room_2m.task.box_range
+    poses = torch.tensor(
+        [
+            [[0.0, 0.0, 2.0], [reach, 0.0, np.pi]],  # In the middle; at a wall, facing away from it ...
+            [
+                [reach, 0.0, 0.0],
+                [0.1, -reach - 0.02, -0.3],
+            ],  # ... facing it; sideways, but with the box too close to it.
+        ]
+    )
+    assert renderer.is_possible(poses).tolist() == [[True, True], [False, False]]
+
+
+def test_every_success_is_possible(renderer, room_2m):
+    data = envs.collect_near_goal(room_2m, 400, np.random.RandomState(3))
+    goals = torch.from_numpy(np.unique(data["goal_pose"], axis=0))
+    assert renderer.is_possible(goals).float().mean() > 0.9  # The robot stops a little nearer or farther than 14 cm.

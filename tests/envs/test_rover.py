@@ -38,7 +38,7 @@ def test_wheels_do_not_slide_sideways_in_a_curve(stage):
     assert velocity @ forward / np.hypot(*velocity) > 0.99
 
 
-def test_zero_action_stops_the_robot(stage):
+def test_speeds_of_zero_stop_the_robot(stage):
     stage.place((0.0, 0.0, 0.0))
     stage.step(forward=1.0, turn=1.0)
     stage.step()
@@ -110,7 +110,7 @@ def test_others_do_see_the_robot():
 
 
 @pytest.mark.parametrize(("reverse_speed", "backward"), [(0.0, 0.0), (0.2, 0.02)])
-def test_a_negative_forward_action_brakes_or_reverses(reverse_speed, backward):
+def test_the_lowest_action_brakes_or_reverses(reverse_speed, backward):
     environment = envs.navigate_2m(random_state=0, reverse_speed=reverse_speed)
     start = environment.reset().observation["rover/pose"]
     environment.step(np.array([-1.0, 0.0]))
@@ -119,6 +119,15 @@ def test_a_negative_forward_action_brakes_or_reverses(reverse_speed, backward):
     environment.close()
     heading = np.array([np.cos(start[2]), np.sin(start[2])])
     assert -heading @ (after - before)[:2] == pytest.approx(backward, abs=1e-3)
+
+
+@pytest.mark.parametrize(("reverse_speed", "middle"), [(0.0, 0.25), (0.5, 0.0), (0.1, 0.2)])
+def test_actions_are_linear_in_the_speeds_and_invert(reverse_speed, middle):
+    rover = Rover(reverse_speed=reverse_speed)
+    assert rover.velocities(np.array([0.0, 0.5])) == pytest.approx((middle, np.deg2rad(50)))
+    for action in ([-1.0, 1.0], [0.3, -0.2], [1.0, 0.0]):
+        np.testing.assert_allclose(rover.action_for(*rover.velocities(np.array(action))), action, atol=1e-12)
+    np.testing.assert_array_equal(rover.action_for(9.0, -9.0), [1.0, -1.0])
 
 
 @pytest.mark.parametrize(

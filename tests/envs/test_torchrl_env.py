@@ -38,7 +38,7 @@ def test_every_named_environment_passes_torchrl_s_check(name):
 
 def test_success_is_terminated_not_truncated(env):
     place(env, (0.0, 0.1, 0.0), box=(0.14, 0.1))
-    out = env.step(act(0.0, 0.0))["next"]
+    out = env.step(act(-1.0, 0.0))["next"]
     assert out["reward"].item() == 1.0
     assert (out["done"].item(), out["terminated"].item(), out["truncated"].item()) == (True, True, False)
 
