@@ -5,6 +5,8 @@
 >>> env.reset()["pixels"].shape
 torch.Size([64, 64, 3])
 >>> env.close()
+
+Importing it registers the Gymnasium ids of all named environments, e.g. ``halgan_rl/Navigate2m-v0``.
 """
 
 from typing import Any
@@ -12,6 +14,7 @@ from typing import Any
 from envs import gl_backend  # First: it settles the OpenGL backend, which mujoco and dm_control read once.
 from envs.environment import Environment
 from envs.golden import fingerprint
+from envs.gymnasium_env import GymnasiumEnv, gymnasium_id, register_named
 from envs.names import NAMES, named
 from envs.navigate import navigate_2m, navigate_4m
 from envs.near_goal import collect_failed, collect_near_goal
@@ -24,15 +27,19 @@ __all__ = [
     "ComposerEnv",
     "Environment",
     "GoalRenderer",
+    "GymnasiumEnv",
     "collect_failed",
     "collect_near_goal",
     "fingerprint",
     "gl_backend",
+    "gymnasium_id",
     "make",
     "named",
     "navigate_2m",
     "navigate_4m",
 ]
+
+register_named()
 
 
 def make(name: str, *, seed: int | None = None, **kwargs: Any) -> ComposerEnv:

@@ -1,9 +1,12 @@
-"""A composer environment that is compiled once and closes its camera."""
+"""A composer environment that is compiled once, starts where it is asked to, and closes its cameras."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from dm_control import composer
+
+from envs.rendering import PersistentCamera
 
 
 class Environment(composer.Environment):
@@ -26,9 +29,41 @@ class Environment(composer.Environment):
             strip_singleton_obs_buffer_dim=True,
             recompile_mjcf_every_episode=False,
         )
+        self._overview: PersistentCamera | None = None
+
+    def reset_to(self, start: Mapping[str, Any]) -> Any:
+        """Starts an episode from a fixed start; later episodes are drawn again.
+
+        Args:
+            start: What is fixed, see the ``fix_start`` of the task; the rest is drawn as usual.
+
+        Returns:
+            The first ``dm_env.TimeStep``.
+
+        Raises:
+            ValueError: if the start is impossible; the episode before goes on.
+        """
+        self.task.fix_start(start)
+        try:
+            return self.reset()
+        finally:
+            self.task.fix_start({})
+
+    def render_overview(self, height: int = 240, width: int = 320) -> np.ndarray:
+        """Renders the room from outside, for people: uint8 [height, width, 3], anti-aliased."""
+        if self._overview is None or self._overview.shape != (height, width):
+            self._close_overview()
+            self._overview = PersistentCamera(self.physics, "overview", height=height, width=width, samples=4)
+        return self._overview.render(self.physics)
+
+    def _close_overview(self) -> None:
+        if self._overview is not None:
+            self._overview.close()
+        self._overview = None
 
     def close(self) -> None:
-        """Frees camera and physics; harmless when repeated."""
+        """Frees cameras and physics; harmless when repeated."""
+        self._close_overview()
         if self._physics is not None:
             self.task.rover.close()
             super().close()

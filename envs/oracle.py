@@ -5,6 +5,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from envs.arenas.walled_room import WALL_GROUP
 from envs.environment import Environment
 from envs.names import named
 
@@ -16,10 +17,11 @@ OUT_OF_SIGHT = (0.0, 100.0)
 
 
 class GoalRenderer:
-    """Renders what the robot would see, had the goal been where hindsight puts it.
+    """Adds the box to images, had it been where hindsight puts it.
 
-    A hallucinator by its call signature. It ignores the pixels that it is given and renders new ones in a physics of
-    its own. Like every OpenGL context it belongs to the thread that renders first (with EGL).
+    A hallucinator by its call signature: it keeps the pixels that it is given but for those of the box, which it
+    renders in a physics of its own. Walls hide no box: most random walks end at a wall, and hindsight then puts the box
+    into it. Like every OpenGL context this one belongs to the thread that renders first (with EGL).
 
     Args:
         environment: Name of an environment, or one (then owned and closed by this renderer).
@@ -39,7 +41,7 @@ class GoalRenderer:
         """Renders the goal into every image.
 
         Args:
-            pixels: uint8 [N, F, H, W, 3], for its shape only.
+            pixels: uint8 [N, F, H, W, 3]; not modified.
             pose: float [N, F, P]: x [m], y [m], yaw [rad], ... of each image.
             goal_pose: float [N, 1, P]: the pose from which the goal is reached.
 
@@ -54,18 +56,17 @@ class GoalRenderer:
         leading = pixels.shape[:-3]
         poses = pose[..., :3].expand(*leading, 3).reshape(-1, 3).double().cpu().numpy()
         goals = goal_pose[..., :3].expand(*leading, 3).reshape(-1, 3).double().cpu().numpy()
-        frames = [self.render(p, self.box_position(g)) for p, g in zip(poses, goals, strict=True)]
-        images = np.stack(frames) if frames else np.empty((0, *pixels.shape[-3:]), np.uint8)
+        images = pixels.reshape(-1, *pixels.shape[-3:]).cpu().numpy().copy()
+        for image, at, goal in zip(images, poses, goals, strict=True):
+            self._add_box(image, at, self.box_position(goal))
         return torch.from_numpy(images).reshape(pixels.shape).to(pixels.device)
 
-    def is_possible(self, goal_pose: Tensor) -> Tensor:
-        """Tells which poses float [..., P] a goal can be reached from, bool [...].
-
-        A robot that faces a wall before it has reached no box: the task puts none into walls.
-        """
-        x, y, yaw = goal_pose[..., :3].unbind(-1)
-        ahead = torch.stack([x + self._goal_offset * yaw.cos(), y + self._goal_offset * yaw.sin()], -1)
-        return (ahead.abs() <= self._environment.task.box_range).all(-1)
+    def _add_box(self, image: np.ndarray, pose: np.ndarray, box_position: np.ndarray) -> None:
+        visible_groups = self._environment.task.rover.camera.options.geomgroup
+        visible_groups[WALL_GROUP] = False
+        without, with_box = self.render(pose), self.render(pose, box_position)
+        visible_groups[WALL_GROUP] = True
+        np.copyto(image, with_box, where=(with_box != without).any(-1, keepdims=True))
 
     def box_position(self, goal_pose: np.ndarray) -> np.ndarray:
         """Where the box stands, x, y [m], for a robot that has reached it at goal_pose [3]."""

@@ -30,6 +30,9 @@ class PersistentCamera:
         samples: Samples a pixel for anti-aliasing; 0 is fastest.
         shadows: Whether lights cast shadows.
 
+    Attributes:
+        options: What is drawn; ``options.geomgroup[i] = False`` leaves out the geoms of group i.
+
     Raises:
         ValueError: if the model has no such camera.
         RuntimeError: if no OpenGL context can be made.
@@ -40,7 +43,7 @@ class PersistentCamera:
     ) -> None:
         self._model = physics.model.ptr
         self._camera = _fixed_camera(self._model, name)
-        self._options = mujoco.MjvOption()
+        self.options = mujoco.MjvOption()
         self._scene = mujoco.MjvScene(self._model, maxgeom=_MAX_GEOMS)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
@@ -65,7 +68,7 @@ class PersistentCamera:
         if self._context is None:
             raise RuntimeError("This camera is closed: make a new environment to render again.")
         mujoco.mjv_updateScene(
-            self._model, physics.data.ptr, self._options, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
+            self._model, physics.data.ptr, self.options, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
         )
         with self._gl.make_current() as thread:
             thread.call(self._draw)

@@ -9,10 +9,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from envs.environment import Environment
-from envs.rendering import PersistentCamera
-
-_OVERSHOOT = 1e-3
-"""Actions this little out of range are clipped (rounding); larger ones are errors."""
+from envs.transition import Transition, advance, read
 
 
 class ComposerEnv(EnvBase):
@@ -31,7 +28,6 @@ class ComposerEnv(EnvBase):
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([]))
         self.environment = environment
         self.rover = environment.task.rover
-        self._overview: PersistentCamera | None = None
         self._make_specs()
 
     def _make_specs(self) -> None:
@@ -50,24 +46,21 @@ class ComposerEnv(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         del tensordict, kwargs
-        return self._pack(self.environment.reset().observation, terminated=False, truncated=False)
+        return self._pack(read(self.environment.reset()))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        timestep = self.environment.step(checked_action(tensordict["action"].numpy()))
-        if timestep.first():
-            raise RuntimeError("The episode is over: call reset before the next step.")
-        terminated = timestep.last() and timestep.discount == 0.0
-        out = self._pack(timestep.observation, terminated, truncated=timestep.last() and not terminated)
-        out.set("reward", torch.tensor([timestep.reward], dtype=torch.float32))
+        transition = advance(self.environment, tensordict["action"].numpy())
+        out = self._pack(transition)
+        out.set("reward", torch.tensor([transition.reward], dtype=torch.float32))
         return out
 
-    def _pack(self, observation: dict[str, np.ndarray], terminated: bool, truncated: bool) -> TensorDict:
+    def _pack(self, transition: Transition) -> TensorDict:
         source = {
-            "pixels": torch.from_numpy(observation["rover/pixels"]),
-            "pose": torch.from_numpy(observation["rover/pose"]),
-            "done": torch.tensor([terminated or truncated]),
-            "terminated": torch.tensor([terminated]),
-            "truncated": torch.tensor([truncated]),
+            "pixels": torch.from_numpy(transition.pixels),
+            "pose": torch.from_numpy(transition.pose),
+            "done": torch.tensor([transition.terminated or transition.truncated]),
+            "terminated": torch.tensor([transition.terminated]),
+            "truncated": torch.tensor([transition.truncated]),
         }
         return TensorDict._new_unsafe(source, batch_size=self.batch_size, device=self.device)
 
@@ -80,32 +73,9 @@ class ComposerEnv(EnvBase):
 
     def render_overview(self, height: int = 240, width: int = 320) -> np.ndarray:
         """Renders the room from outside, for people: uint8 [height, width, 3], anti-aliased."""
-        if self._overview is None or self._overview.shape != (height, width):
-            self._close_overview()
-            self._overview = PersistentCamera(
-                self.environment.physics, "overview", height=height, width=width, samples=4
-            )
-        return self._overview.render(self.environment.physics)
-
-    def _close_overview(self) -> None:
-        if self._overview is not None:
-            self._overview.close()
-        self._overview = None
+        return self.environment.render_overview(height, width)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Frees cameras and physics."""
         super().close(raise_if_closed=raise_if_closed)
-        self._close_overview()
         self.environment.close()
-
-
-def checked_action(action: np.ndarray) -> np.ndarray:
-    """An action [2] clipped to [-1, 1].
-
-    Raises:
-        ValueError: if an entry is not a number, or out of range by more than rounding.
-    """
-    # Written so that NaN fails too.
-    if not abs(action).max() <= 1 + _OVERSHOOT:
-        raise ValueError(f"Actions must lie in [-1, 1]; got {action.tolist()}: squash or clamp the policy's output.")
-    return np.clip(action, -1.0, 1.0)

@@ -25,13 +25,6 @@ class Hallucinator(Protocol):
         """
 
 
-class Renderer(Hallucinator, Protocol):
-    """A hallucinator that knows the truth: a simulator."""
-
-    def is_possible(self, goal_pose: Tensor) -> Tensor:
-        """Tell from which poses ``[..., P]`` a goal could be reached at all, bool ``[...]``."""
-
-
 class GanHallucinator:
     """Paints goals with a trained generator.
 

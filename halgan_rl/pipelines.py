@@ -6,19 +6,17 @@ Each is a plain function that returns a :class:`torchrl.envs.Compose`; its membe
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import NestedKey
-from torch import Tensor
 from torchrl.envs import Compose
 
 from halgan_rl.poses import PoseTolerance
 from halgan_rl.transforms import DrawHindsightGoal, HallucinateGoal, HindsightReward, StampFuturePoses
 
 if TYPE_CHECKING:
-    from halgan_rl.hallucinators import Hallucinator, Renderer
+    from halgan_rl.hallucinators import Hallucinator
 
 
 def halgan(
@@ -31,7 +29,6 @@ def halgan(
     annealing_steps: int = 60_000,
     nearness: float = 1.0,
     tolerance: PoseTolerance = PoseTolerance(),  # noqa: B008 (frozen)
-    possible: Callable[[Tensor], Tensor] | None = None,
     success_reward: float = 1.0,
     fixed_shape: bool = False,
     pixels_key: NestedKey = "pixels",
@@ -54,7 +51,6 @@ def halgan(
         annealing_steps: Frames from the one share to the other, counted by ``pipeline[1].step(frames)``.
         nearness: Preference for near goals; 1 draws them uniformly, as the paper does.
         tolerance: When a pose is the goal pose.
-        possible: Which poses could be a goal; None takes every pose, as the paper does.
         success_reward: Added to the reward of a relabelled row that reaches its goal.
         fixed_shape: Whether to hallucinate all rows, so that no shape depends on the data.
         pixels_key: Images uint8 ``[H, W, 3]``.
@@ -88,7 +84,6 @@ def halgan(
             generator=generator,
             nearness=nearness,
             tolerance=tolerance,
-            possible=possible,
             pose_key=pose_key,
             hindsight_key=hindsight_key,
             goal_key=goal_key,
@@ -113,17 +108,14 @@ def halgan(
     )
 
 
-def oracle(renderer: Renderer, **options: Any) -> Compose:
+def oracle(renderer: Hallucinator, **options: Any) -> Compose:
     """Perfect hallucinations: :func:`halgan` with the goal rendered by the simulator itself.
 
-    Goals are drawn only from poses that a goal could be reached from: nobody sees a goal inside a wall.
-
     Args:
-        renderer: Renders what is seen from each pose with the goal moved to where hindsight puts it, and knows which
-            poses are possible.
+        renderer: Adds to each image what the simulator shows of a goal where hindsight puts it.
         **options: Those of :func:`halgan`, ``generator`` among them.
 
     Returns:
         What :func:`halgan` returns.
     """
-    return halgan(renderer, possible=renderer.is_possible, **options)
+    return halgan(renderer, **options)

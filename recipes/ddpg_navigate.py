@@ -42,20 +42,17 @@ Differences from the paper (Sahni et al., NeurIPS 2019, appendix), all undone by
 
 In both rooms the rover has no reverse gear, action -1 is rest and +1 full speed: a random walk that reverses takes half
 of its hindsight goals from behind the robot, where no camera sees them (``envs.make(..., reverse_speed=0.5)`` gives it
-one). The oracle relabels towards poses only from which the task's box could be reached, never into a wall.
+one).
 """
 
-import argparse
 import dataclasses
 import time
-from collections.abc import Sequence
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
 import torch
-import tyro
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.collectors import Collector
@@ -76,6 +73,7 @@ from halgan_rl.hallucinators import GanHallucinator, Hallucinator
 from halgan_rl.models.agents import Actor, Critic, deterministic_policy
 from halgan_rl.objectives import ClippedTD0Estimator, UnsaturatedDDPGLoss
 from halgan_rl.poses import PoseTolerance
+from halgan_rl.presets import parse_config
 from halgan_rl.run_folder import RunFolder, read_metrics, versions
 from halgan_rl.weights import load_generator, save_weights, shipped_weights
 
@@ -114,7 +112,7 @@ class Config:
     """Accept weights trained with another release of MuJoCo, whose images may differ."""
     seed: int = 0
     """Seed of everything random in the run."""
-    total_frames: int = 20_000
+    total_frames: int = 15_000
     """Environment steps."""
     out: Path = Path("runs/ddpg_navigate")
     """Folder of the run; must not hold one yet."""
@@ -220,14 +218,6 @@ PRESETS = {
 }
 
 
-def parse_config(args: Sequence[str] | None = None) -> Config:
-    """Read the command line: `--preset` chooses the defaults of all other flags."""
-    parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument("--preset", choices=PRESETS, default="default")
-    preset = parser.parse_known_args(args)[0].preset
-    return tyro.cli(Config, args=args, default=PRESETS[preset], description=__doc__)
-
-
 def make_hallucinator(config: Config) -> Hallucinator | None:
     """Return who paints the goal; weights that do not fit the environment are refused here."""
     if config.hindsight == "none":
@@ -257,6 +247,29 @@ def make_hindsight(config: Config, hallucinator: Hallucinator | None) -> Compose
         final_probability=config.hallucination_end,
         annealing_steps=config.hallucination_frames,
         tolerance=PoseTolerance(config.goal_distance, config.goal_angle),
+        generator=torch.Generator().manual_seed(config.seed),
+    )
+
+
+def make_collector(config: Config, env: ComposerEnv, explorer: TensorDictSequential) -> Collector:
+    """Return what steps the environment: uniformly random actions first, then the exploring policy."""
+    return Collector(
+        env,
+        explorer,
+        frames_per_batch=config.frames_per_batch,
+        total_frames=config.total_frames,
+        init_random_frames=config.warmup_frames,
+        track_traj_ids=False,
+        auto_register_policy_transforms=False,
+    )
+
+
+def make_buffer(config: Config, hindsight: Compose | None) -> TensorDictReplayBuffer:
+    """Return the replay buffer."""
+    return TensorDictReplayBuffer(
+        storage=LazyTensorStorage(config.replay_capacity),
+        batch_size=config.batch_size,
+        transform=hindsight,
         generator=torch.Generator().manual_seed(config.seed),
     )
 
@@ -313,18 +326,23 @@ def update(
 class Means:
     """Running means of the figures between two evaluations, without a synchronisation an update."""
 
-    def __init__(self) -> None:
-        self._values: dict[str, list[torch.Tensor]] = {}
+    def __init__(self, *names: str) -> None:
+        self._values: dict[str, list[torch.Tensor]] = {name: [] for name in names}
 
     def add(self, **values: torch.Tensor) -> None:
         """Add one value to each mean."""
         for name, value in values.items():
-            self._values.setdefault(name, []).append(value.detach())
+            self._values[name].append(value.detach())
 
-    def pop(self, name: str) -> float:
-        """Return a mean and forget it; NaN if nothing was added."""
-        values = self._values.pop(name, [])
-        return float(torch.stack(values).float().mean()) if values else float("nan")
+    def pop(self) -> dict[str, float]:
+        """Return all means and start afresh; NaN where nothing was added."""
+        means = {f"train/{name}": _mean(values) for name, values in self._values.items()}
+        self._values = {name: [] for name in self._values}
+        return means
+
+
+def _mean(values: list[torch.Tensor]) -> float:
+    return float(torch.stack(values).float().mean()) if values else float("nan")
 
 
 def main(config: Config) -> None:
@@ -347,32 +365,17 @@ def main(config: Config) -> None:
     actor, critic = make_agent(config, action_size=action_spec.shape[-1])
     noise = AdditiveGaussianModule(action_spec, sigma_init=config.noise, sigma_end=config.noise)
     epsilon = EGreedyModule(action_spec, config.epsilon_start, config.epsilon_end, config.epsilon_frames)
-    explorer = TensorDictSequential(actor, noise, epsilon)
+    collector = make_collector(config, env, TensorDictSequential(actor, noise, epsilon))
 
-    # Collection, and replay with hindsight: failed rows come out of the buffer as successes.
-    collector = Collector(
-        env,
-        explorer,
-        frames_per_batch=config.frames_per_batch,
-        total_frames=config.total_frames,
-        init_random_frames=config.warmup_frames,
-        track_traj_ids=False,
-        auto_register_policy_transforms=False,
-    )
+    # Replay with hindsight: failed rows come out of the buffer as successes.
     hindsight = make_hindsight(config, hallucinator)
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(config.replay_capacity),
-        batch_size=config.batch_size,
-        transform=hindsight,
-        generator=torch.Generator().manual_seed(config.seed),
-    )
+    buffer = make_buffer(config, hindsight)
 
     # Learning.
     loss, target_updater = make_loss(config, actor, critic)
     optimizer = make_optimizer(config, loss)
-    means = Means()
-    frames, updates, next_evaluation = 0, 0, config.evaluate_every
-    evaluation_success = float("nan")
+    means = Means("success_rate", "hallucinated_fraction", "q_value", "loss_value", "loss_actor")
+    frames, updates, next_evaluation, success = 0, 0, config.evaluate_every, float("nan")
     progress = tqdm(total=config.total_frames, unit="frame", desc=config.hindsight, dynamic_ncols=True)
     for rollout in collector:
         buffer.extend(rollout)
@@ -381,14 +384,14 @@ def main(config: Config) -> None:
         if hindsight is not None:
             hindsight[1].step(rollout.numel())
         if (done := rollout["next", "done"]).any():
-            means.add(success=rollout["next", "terminated"][done].float().mean())
+            means.add(success_rate=rollout["next", "terminated"][done].float().mean())
 
         while frames > config.warmup_frames and updates < (frames - config.warmup_frames) // config.frames_per_update:
             batch = buffer.sample()
             losses = update(batch, loss, optimizer, target_updater)
             updates += 1
             means.add(
-                hallucinated=batch["goal", "mask"].float().mean() if hindsight is not None else torch.zeros(()),
+                hallucinated_fraction=batch["goal", "mask"].float().mean() if hindsight else torch.zeros(()),
                 q_value=losses["pred_value"].mean(),
                 loss_value=losses["loss_value"],
                 loss_actor=losses["loss_actor"],
@@ -397,31 +400,24 @@ def main(config: Config) -> None:
         if frames >= next_evaluation or frames >= config.total_frames:
             next_evaluation += config.evaluate_every
             evaluation = evaluate(evaluation_env, actor, seeds=starts)
-            evaluation_success = evaluation.success_rate
-            metrics = {
-                "frames": frames,
-                "seconds": time.perf_counter() - started,
-                **evaluation.metrics(),
-                "train/success_rate": means.pop("success"),
-                "train/hallucinated_fraction": means.pop("hallucinated"),
-                "train/q_value": means.pop("q_value"),
-                "train/loss_value": means.pop("loss_value"),
-                "train/loss_actor": means.pop("loss_actor"),
-                "train/epsilon": float(epsilon.eps),
-            }
+            success = evaluation.success_rate
+            metrics = {"frames": frames, "seconds": time.perf_counter() - started, "train/epsilon": float(epsilon.eps)}
+            metrics |= evaluation.metrics() | means.pop()
             folder.write_metrics(metrics)
             save_policy(folder, config, actor[0].module)
-            for name, value in metrics.items():
-                if logger is not None:
+            if logger is not None:
+                for name, value in metrics.items():
                     logger.log_scalar(name, value, step=frames)
         progress.update(rollout.numel())
-        progress.set_postfix(success=f"{evaluation_success:.0%}", updates=updates, refresh=False)
+        progress.set_postfix(success=f"{success:.0%}", updates=updates, refresh=False)
     progress.close()
     collector.shutdown()
 
-    draw_pictures(folder, config, buffer, evaluation_env, actor)
+    draw_pictures(folder, config, evaluation_env, actor)
+    if hallucinator is not None:
+        draw_hallucinations(folder.file("hallucinations.png"), config, buffer, hallucinator)
     print(
-        f"success rate {evaluation_success:.0%} after {frames} frames; pictures and weights in {config.out}\n"
+        f"success rate {success:.0%} after {frames} frames; pictures and weights in {config.out}\n"
         f"next: python recipes/play.py --run {config.out}"
     )
 
@@ -447,32 +443,31 @@ def save_policy(folder: RunFolder, config: Config, actor: Actor) -> None:
     save_weights(folder.file("policy.safetensors"), actor, manifest)
 
 
-def draw_pictures(
-    folder: RunFolder, config: Config, buffer: TensorDictReplayBuffer, env: ComposerEnv, actor: TensorDictModule
-) -> None:
-    """Draw the learning curve, the trained agent, and hallucinations beside the truth."""
-    title = f"{config.environment}, {config.hindsight}, seed {config.seed}"
-    pictures.draw_learning_curves(
-        folder.file("curve.png"), {config.hindsight: [read_metrics(folder.file("metrics.csv"))]}, title=title
-    )
+def draw_pictures(folder: RunFolder, config: Config, env: ComposerEnv, actor: TensorDictModule) -> None:
+    """Draw the learning curve, and film the trained agent."""
+    curve = {config.hindsight: [read_metrics(folder.file("metrics.csv"))]}
+    pictures.draw_learning_curves(folder.file("curve.png"), curve, title=title_of(config))
     starts = range(EVALUATION_SEED, EVALUATION_SEED + config.film_starts)
     film = record(env, actor, partial(env.render_overview, 256, 320), seeds=starts)
     pictures.write_gif(folder.file("agent.gif"), film)
-    if config.hindsight != "none":
-        draw_hallucinations(folder.file("hallucinations.png"), config, buffer, title=title)
 
 
-def draw_hallucinations(path: Path, config: Config, buffer: TensorDictReplayBuffer, *, title: str) -> None:
+def draw_hallucinations(path: Path, config: Config, buffer: TensorDictReplayBuffer, hallucinator: Hallucinator) -> None:
     """Draw stored rows: the frame as it was, a goal some steps ahead truly rendered, and as the agent is shown it."""
     steps = min(12, config.max_distance)
     rows = buffer.storage[torch.linspace(0, len(buffer) - 1, 200).long()]  # past the transform, which would relabel
     rows = rows[rows["hindsight", "horizon"].squeeze(-1) >= steps][::16]
     goal = rows["hindsight", "pose"][:, [steps - 1]]
     frames, poses = rows["pixels"].unsqueeze(1), rows["pose"].unsqueeze(1)
-    painters = {"true goal": GoalRenderer(config.environment), config.hindsight: make_hallucinator(config)}
+    painters = {"true goal": GoalRenderer(config.environment), config.hindsight: hallucinator}
     painted = {label: painter(frames, poses, goal).squeeze(1) for label, painter in painters.items()}
-    pictures.draw_frame_grid(path, {"failed": rows["pixels"], **painted}, title=title)
+    pictures.draw_frame_grid(path, {"failed": rows["pixels"], **painted}, title=title_of(config))
+
+
+def title_of(config: Config) -> str:
+    """Return what the pictures of a run are headed with."""
+    return f"{config.environment}, {config.hindsight}, seed {config.seed}"
 
 
 if __name__ == "__main__":
-    main(parse_config())
+    main(parse_config(PRESETS, description=__doc__))

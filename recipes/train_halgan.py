@@ -44,18 +44,15 @@ Differences from the paper (Sahni et al., NeurIPS 2019, appendix), all undone by
 8. Frames are mirrored left to right, and their configurations with them.
 """
 
-import argparse
 import dataclasses
 import shlex
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
-import tyro
 from torch import Tensor
 from tqdm import tqdm
 
@@ -64,6 +61,7 @@ from halgan_rl import fidelity, pictures
 from halgan_rl.gan_training import GanSettings, HalganTrainer
 from halgan_rl.hallucinators import GanHallucinator
 from halgan_rl.models import CoordinateGenerator, Discriminator, HallucinationGenerator, PaperGenerator
+from halgan_rl.presets import parse_config
 from halgan_rl.run_folder import RunFolder, versions
 from halgan_rl.warm_start import warm_start
 from halgan_rl.weights import save_weights
@@ -160,14 +158,6 @@ PRESETS = {
         game=GanSettings(),
     ),
 }
-
-
-def parse_config(args: Sequence[str] | None = None) -> Config:
-    """Read the command line: `--preset` chooses the defaults of all other flags."""
-    parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument("--preset", choices=PRESETS, default="default")
-    preset = parser.parse_known_args(args)[0].preset
-    return tyro.cli(Config, args=args, default=PRESETS[preset], description=__doc__)
 
 
 def main(config: Config) -> None:
@@ -286,4 +276,4 @@ def make_manifest(config: Config, generator: HallucinationGenerator, metrics: di
 
 
 if __name__ == "__main__":
-    main(parse_config())
+    main(parse_config(PRESETS, description=__doc__))

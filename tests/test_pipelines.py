@@ -17,26 +17,7 @@ from tests import toy
 from tests.transforms.rows import RENAMED, assert_identical, invert, leaves, random_source, rename, stamped_by_reference
 
 DISTANCE = 6
-
-
-class Truth:
-    """The toy's exact hallucinator as a renderer: every pose is possible."""
-
-    def __init__(self, paint: Callable) -> None:
-        self.paint = paint
-
-    def __call__(self, *args: torch.Tensor) -> torch.Tensor:
-        return self.paint(*args)
-
-    def is_possible(self, goal_pose: torch.Tensor) -> torch.Tensor:
-        return torch.ones(goal_pose.shape[:-1], dtype=torch.bool)
-
-
-def oracle(paint: Callable, **options: object) -> Compose:
-    return pipelines.oracle(Truth(paint), **options)
-
-
-NAMED = {"halgan": pipelines.halgan, "oracle": oracle}
+NAMED = {"halgan": pipelines.halgan, "oracle": pipelines.oracle}
 EVERY = pytest.mark.parametrize("pipeline", NAMED.values(), ids=NAMED.keys())
 
 

@@ -16,6 +16,8 @@ _WALLS = (
     ("south", 1.5 * np.pi, (0.52, 0.47, 0.60), (0.60, 0.55, 0.68)),
 )
 _THICKNESS = 0.05
+WALL_GROUP = 1
+"""Group of the walls' geoms, by which a camera can leave them out."""
 
 
 class WalledRoom(composer.Arena):
@@ -71,7 +73,7 @@ class WalledRoom(composer.Arena):
         self._mjcf_root.worldbody.add(
             "geom", name=name, type="box", size=[_THICKNESS / 2, self.size / 2 + _THICKNESS, height / 2],
             pos=[*centre, height / 2], euler=[0, 0, angle], material=material,
-            **CONTACT,
+            group=WALL_GROUP, **CONTACT,
         )  # fmt: skip
 
     def _material(self, name: str, dark: tuple[float, ...], light: tuple[float, ...], repeat: float) -> Any:

@@ -1,5 +1,6 @@
 """Navigate: find the box, drive up to it, and centre it in the image."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -8,10 +9,13 @@ from dm_control import composer
 from envs.arenas.walled_room import WalledRoom
 from envs.props.goal_box import GoalBox
 from envs.robots.rover import Rover
+from envs.tasks.fixed_start import read_start
 
 _MAX_DRAWS = 10_000
 _WALL_CLEARANCE = 0.02
 """Between the robot and a wall at the start of an episode [m]."""
+_START = {"pose": ("x [m]", "y [m]", "yaw [rad]"), "box": ("x [m]", "y [m]")}
+"""What of a start can be fixed, and what the numbers mean."""
 
 
 class Navigate(composer.Task):
@@ -64,6 +68,7 @@ class Navigate(composer.Task):
         self._check_room()
         self._attach()
         self.set_timesteps(control_timestep, physics_timestep)
+        self._fixed: dict[str, np.ndarray] = {}
         self._succeeded = False
         self._energy = 0.0
 
@@ -117,24 +122,70 @@ class Navigate(composer.Task):
         return self.rover.action_spec
 
     def initialize_episode(self, physics: Any, random_state: np.random.RandomState) -> None:
-        """Places robot and box at random."""
-        pose, position = self.draw_start(random_state)
+        """Places robot and box where :meth:`fix_start` says, else at random."""
+        pose, position = self.draw_start(random_state, **self._fixed)
         self.rover.set_pose(physics, pose)
         self.goal_box.set_position(physics, position)
         self._succeeded = False
         self._energy = 0.0
 
-    def draw_start(self, random_state: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+    def fix_start(self, start: Mapping[str, Any]) -> None:
+        """Fixes where episodes start, until it is called again; what is not given is drawn.
+
+        Args:
+            start: Any of ``pose``, the robot's x [m], y [m], yaw [rad], and ``box``, its x [m], y [m]. If both are
+                given they may be closer to each other than ``min_start_distance``.
+
+        Raises:
+            ValueError: if a name is unknown, numbers are missing or not finite, one of the two is not in the room, or
+                they overlap. What was fixed before then stays fixed.
+        """
+        fixed = read_start(start, _START)
+        self._check_in_room("pose", fixed, self.rover.radius)
+        self._check_in_room("box", fixed, self.goal_box.size / 2)
+        self._check_apart(fixed)
+        self._fixed = fixed
+
+    def _check_in_room(self, name: str, fixed: Mapping[str, np.ndarray], extent: float) -> None:
+        limit = self.arena.size / 2 - extent
+        if name in fixed and np.abs(fixed[name][:2]).max() > limit:
+            raise ValueError(
+                f"{name}={fixed[name].tolist()} is not inside the room of {self.arena.size} m: "
+                f"choose x and y in [-{limit:g}, {limit:g}] m."
+            )
+
+    def _check_apart(self, fixed: Mapping[str, np.ndarray]) -> None:
+        if len(fixed) < len(_START):
+            return
+        pose, box = fixed["pose"], fixed["box"]
+        gap = np.hypot(*np.maximum(np.abs(pose[:2] - box) - self.goal_box.size / 2, 0)) - self.rover.radius
+        if gap < 0:
+            raise ValueError(
+                f"pose={pose.tolist()} and box={box.tolist()} overlap by {-gap:.3f} m: move them apart, "
+                f"{self.rover.radius + self.goal_box.radius:.3f} m between the centres are always enough."
+            )
+
+    def draw_start(
+        self, random_state: np.random.RandomState, pose: np.ndarray | None = None, box: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """A robot pose [3] and a box position [2], uniform among those far enough apart.
+
+        Args:
+            random_state: Source of what is drawn.
+            pose: Fixes the robot's pose [3].
+            box: Fixes the box's position [2].
 
         Raises:
             EpisodeInitializationError: if none is found in many draws.
         """
+        if pose is not None and box is not None:
+            return pose, box
         for _ in range(_MAX_DRAWS):
-            robot = random_state.uniform(-self._robot_range, self._robot_range, size=2)
-            box = random_state.uniform(-self.box_range, self.box_range, size=2)
-            if np.hypot(*(robot - box)) >= self.min_start_distance:
-                return np.array([*robot, random_state.uniform(-np.pi, np.pi)]), box
+            robot = random_state.uniform(-self._robot_range, self._robot_range, size=2) if pose is None else pose[:2]
+            position = random_state.uniform(-self.box_range, self.box_range, size=2) if box is None else box
+            if np.hypot(*(robot - position)) >= self.min_start_distance:
+                yaw = random_state.uniform(-np.pi, np.pi) if pose is None else pose[2]
+                return np.array([*robot, yaw]), position
         raise composer.EpisodeInitializationError(
             f"No start with robot and box {self.min_start_distance} m apart in {_MAX_DRAWS} draws: "
             "use a larger room or a smaller min_start_distance."

@@ -1,6 +1,5 @@
 """The first step of the sample path: which rows are relabelled, and to which goal."""
 
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -15,8 +14,8 @@ class DrawHindsightGoal(ReplayTransform):
     """Draws, for each sampled row, whether it is relabelled and which later pose of its episode becomes its goal.
 
     **Core rule.** A row is relabelled with the given probability, towards the pose d steps later, d uniform in
-    1 ... horizon (or nearer, see ``nearness``). It never is if its horizon is 0, if no pose
-    ahead is possible as a goal, or if it already stands at the goal drawn.
+    1 ... horizon (or nearer, see ``nearness``). It never is if its horizon is 0, or if it already stands at the goal
+    drawn.
 
     The probability is annealed linearly, as in :class:`torchrl.modules.EGreedyModule`: call :meth:`step` with the
     number of frames collected. It and the generator's state are part of ``state_dict()``.
@@ -32,8 +31,6 @@ class DrawHindsightGoal(ReplayTransform):
         nearness: Preference k >= 1 for near goals: d is 1 + floor(horizon * u^k), u uniform in [0, 1). 1 is uniform, as
             in the paper; with 2 and a horizon of 32, the next pose is the goal 6 times as often.
         tolerance: When a row already stands at its goal; None relabels such rows too.
-        possible: Maps poses ``[..., D, P]`` to bool ``[..., D]``: from which of them a goal could be reached at all.
-            Goals are then drawn among those only; None takes every pose, as the paper does.
         pose_key: Pose ``[P]`` of the row.
         hindsight_key: Where :class:`~halgan_rl.transforms.StampFuturePoses` wrote ``"pose"`` and ``"horizon"``.
         goal_key: Where ``"mask"`` ``[1]`` bool and ``"pose"`` ``[P]`` are written; the pose means nothing where the
@@ -65,7 +62,6 @@ class DrawHindsightGoal(ReplayTransform):
         generator: torch.Generator,
         nearness: float = 1.0,
         tolerance: PoseTolerance | None = PoseTolerance(),  # noqa: B008 (frozen)
-        possible: Callable[[Tensor], Tensor] | None = None,
         pose_key: NestedKey = "pose",
         hindsight_key: NestedKey = "hindsight",
         goal_key: NestedKey = "goal",
@@ -84,7 +80,6 @@ class DrawHindsightGoal(ReplayTransform):
             raise ValueError(f"nearness must be at least 1, got {nearness}.")
         self.nearness = nearness
         self.tolerance = tolerance
-        self.possible = possible
         self.pose_key = pose_key
         self.hindsight_key = hindsight_key
         self.goal_key = goal_key
@@ -106,8 +101,8 @@ class DrawHindsightGoal(ReplayTransform):
         pose = self._read(tensordict, self.pose_key, "pose_key")
         futures = self._read(tensordict, unravel_key((self.hindsight_key, "pose")), "hindsight_key")
         horizon = self._read(tensordict, unravel_key((self.hindsight_key, "horizon")), "hindsight_key")
-        goal_pose, found = self._draw_pose(futures, horizon)
-        mask = (self._uniform(horizon) < self.probability) & found
+        goal_pose = self._draw_pose(futures, horizon)
+        mask = (self._uniform(horizon) < self.probability) & (horizon > 0)
         if self.tolerance is not None:
             mask = mask & ~self.tolerance(pose, goal_pose).unsqueeze(-1)
         tensordict.set(unravel_key((self.goal_key, "mask")), mask)
@@ -122,16 +117,11 @@ class DrawHindsightGoal(ReplayTransform):
         """Restores what :meth:`get_extra_state` returned."""
         self.generator.set_state(state["generator"].cpu())
 
-    def _draw_pose(self, futures: Tensor, horizon: Tensor) -> tuple[Tensor, Tensor]:
-        """Picks one of the first ``horizon`` possible poses ``[..., D, P]``: ``[..., P]``, and whether there is one."""
-        candidates = torch.arange(futures.shape[-2], device=futures.device) < horizon
-        if self.possible is not None:
-            candidates = candidates & self.possible(futures)
-        count = candidates.sum(-1, keepdim=True)
-        rank = (self._uniform(horizon) ** self.nearness * count).long()
-        rank = torch.minimum(rank, count - 1).clamp(min=0)  # against rounding up; without candidates nothing is found
-        index = (candidates.cumsum(-1) > rank).long().argmax(-1, keepdim=True)
-        return torch.take_along_dim(futures, index.unsqueeze(-1), dim=-2).squeeze(-2), count > 0
+    def _draw_pose(self, futures: Tensor, horizon: Tensor) -> Tensor:
+        """Picks one of the first ``horizon`` poses ``[..., D, P]``: ``[..., P]``."""
+        index = (self._uniform(horizon) ** self.nearness * horizon).long()
+        index = torch.minimum(index, horizon - 1).clamp(min=0)  # against rounding up; horizon 0 is masked out later
+        return torch.take_along_dim(futures, index.unsqueeze(-1), dim=-2).squeeze(-2)
 
     def _uniform(self, like: Tensor) -> Tensor:
         """Draws from [0, 1), one number for each entry of ``like``."""

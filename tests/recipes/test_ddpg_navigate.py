@@ -8,9 +8,10 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from halgan_rl.presets import parse_config
 from halgan_rl.run_folder import read_metrics
 from recipes import play
-from recipes.ddpg_navigate import PRESETS, Config, main, parse_config
+from recipes.ddpg_navigate import PRESETS, Config, main
 
 TINY = dataclasses.replace(
     Config(),
@@ -22,6 +23,7 @@ TINY = dataclasses.replace(
     evaluate_every=80,
     evaluation_starts=1,
     film_starts=1,
+    bank=False,
 )
 
 
@@ -80,6 +82,7 @@ def test_seed_and_method_change_what_is_learned(halgan_run: Path, tmp_path: Path
         "seed": {"seed": 1},
         "oracle": {"hindsight": "oracle"},
         "none": {"hindsight": "none"},
+        "bank": {"bank": True},
     }.items():
         assert differ(trained, run(tmp_path / name, **changes)) == set(trained), name
     assert not (tmp_path / "none" / "hallucinations.png").exists()
@@ -109,7 +112,7 @@ def test_weights_for_another_room_are_refused_before_the_folder_is_made(tmp_path
 @pytest.mark.parametrize("args", [["--no-such-flag", "1"], ["--hindsight", "magic"], ["--preset", "nature"]])
 def test_unknown_flags_and_methods_are_refused(args: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_:
-        parse_config(args)
+        parse_config(PRESETS, args, description=None)
     assert exit_.value.code == 2
     assert args[1] in (printed := "".join(capsys.readouterr())) or args[0] in printed
 
@@ -125,9 +128,9 @@ def test_values_that_cannot_work_are_refused(changes: dict[str, float]) -> None:
 
 
 def test_the_preset_chooses_the_defaults_and_flags_win() -> None:
-    assert parse_config([]) == PRESETS["default"]
-    assert parse_config(["--preset", "paper"]) == PRESETS["paper"]
-    config = parse_config(["--preset", "paper", "--batch-size", "16"])
+    assert parse_config(PRESETS, [], description=None) == PRESETS["default"]
+    assert parse_config(PRESETS, ["--preset", "paper"], description=None) == PRESETS["paper"]
+    config = parse_config(PRESETS, ["--preset", "paper", "--batch-size", "16"], description=None)
     assert config == dataclasses.replace(PRESETS["paper"], batch_size=16)
 
 

@@ -12,9 +12,10 @@ from safetensors.torch import load_file
 import envs
 from halgan_rl.gan_training import GanSettings
 from halgan_rl.hallucinators import GanHallucinator
+from halgan_rl.presets import parse_config
 from halgan_rl.run_folder import read_metrics
 from halgan_rl.weights import load_generator
-from recipes.train_halgan import PRESETS, Config, main, parse_config
+from recipes.train_halgan import PRESETS, Config, main
 
 TINY = dataclasses.replace(
     Config(),
@@ -79,7 +80,7 @@ def test_a_folder_that_holds_a_run_is_refused_first(tmp_path: Path) -> None:
 @pytest.mark.parametrize("args", [["--no-such-flag", "1"], ["--environment", "moon"], ["--preset", "nature"]])
 def test_unknown_flags_and_names_are_refused(args: list[str]) -> None:
     with pytest.raises(SystemExit):
-        parse_config(args)
+        parse_config(PRESETS, args, description=None)
 
 
 @pytest.mark.parametrize("changes", [{"near_goal_frames": 0}, {"iterations": -1}, {"generator": "paper"}])
@@ -89,7 +90,7 @@ def test_values_that_cannot_work_are_refused(changes: dict[str, int]) -> None:
 
 
 def test_the_preset_chooses_the_defaults_and_flags_win() -> None:
-    assert parse_config([]) == PRESETS["default"]
-    config = parse_config(["--preset", "paper", "--game.critic-steps", "2"])
+    assert parse_config(PRESETS, [], description=None) == PRESETS["default"]
+    config = parse_config(PRESETS, ["--preset", "paper", "--game.critic-steps", "2"], description=None)
     paper = PRESETS["paper"]
     assert config == dataclasses.replace(paper, game=dataclasses.replace(paper.game, critic_steps=2))

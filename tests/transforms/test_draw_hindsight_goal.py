@@ -156,19 +156,3 @@ def test_a_share_outside_zero_to_one_is_refused(name: str, value: float) -> None
 def test_annealing_over_no_frames_is_refused() -> None:
     with pytest.raises(ValueError, match="annealing_steps must be at least 1 frame, got 0"):
         draw(annealing_steps=0)
-
-
-@pytest.mark.parametrize("nearness", [1.0, 2.0])
-def test_goals_are_drawn_among_the_possible_poses_of_the_horizon(nearness: float) -> None:
-    even = draw(possible=lambda pose: pose[..., 0] % 2 == 0, nearness=nearness)
-    out = even(rows(20_000, 7))
-    assert out["goal", "mask"].all()
-    count = torch.bincount(offsets(out), minlength=STEPS + 1)
-    assert count.nonzero().flatten().tolist() == [2, 4, 6]  # 8 is possible, but past the horizon
-    share = torch.tensor([(k / 3) ** (1 / nearness) - ((k - 1) / 3) ** (1 / nearness) for k in (1, 2, 3)])
-    assert (count[[2, 4, 6]] / 20_000 - share).abs().max() < 0.02
-
-
-def test_rows_without_a_possible_goal_ahead_are_left_alone() -> None:
-    late = draw(possible=lambda pose: pose[..., 0] > 5)
-    assert late(rows(3, [5, 6, 0]))["goal", "mask"].flatten().tolist() == [False, True, False]
