@@ -2,17 +2,19 @@
 
 Usage::
 
-    python -m benchmarks.update_cost   # one thread, the recipe's batch of 64
+    python -m benchmarks.update_cost   # one thread, the recipe's batch
 
 Times one update of the recipe (sample, loss, backward, both optimizer steps, target update) with no hindsight, with
-HALGAN and with the simulator as oracle, at the share of relabelled rows that the recipe starts from and at its mean
-over a run. Medians of alternating rounds; quote the ratios, machines are noisy.
+HALGAN looked up in the bank, with its generator itself and with the simulator as oracle, at the share of relabelled
+rows that the recipe starts from and at its mean over a run. Medians of alternating rounds; quote the ratios, machines
+are noisy.
 """
 
 import dataclasses
 import statistics
 import time
 from collections.abc import Callable
+from typing import Any
 
 import torch
 import tyro
@@ -29,6 +31,13 @@ from recipes.ddpg_navigate import (
     make_optimizer,
     update,
 )
+
+PAINTERS: dict[str, dict[str, Any]] = {
+    "bank": {"bank": True},
+    "generator": {"bank": False},
+    "oracle": {"hindsight": "oracle"},
+}
+"""Who paints, as changes of the recipe's configuration."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,10 +90,10 @@ def main(benchmark: Benchmark) -> None:
     env.close()
     mean_share = default.hallucination_start * (1 - default.total_frames / default.hallucination_frames / 2)
     updates = {"none": make_update(dataclasses.replace(default, hindsight="none"), rollout)}
-    for hindsight in ("halgan", "oracle"):
+    for name, changes in PAINTERS.items():
         for share in (default.hallucination_start, mean_share):
-            config = dataclasses.replace(default, hindsight=hindsight, hallucination_start=share)
-            updates[f"{hindsight}, {share:.1%} relabelled"] = make_update(config, rollout)
+            config = dataclasses.replace(default, hallucination_start=share, **changes)
+            updates[f"{name}, {share:.1%} relabelled"] = make_update(config, rollout)
     milliseconds = median_milliseconds(updates, benchmark)
     print(f"batch {default.batch_size}, {benchmark.threads} thread(s), medians of {benchmark.rounds} rounds")
     print(f"{'':28s} {'ms an update':>12s} {'share of it':>12s} {'ratio':>7s}")
