@@ -46,10 +46,10 @@ class BankGrid:
     nearest: float = 0.1
     farthest: float = 6.0
     widest: float = pi / 4
-    distances: int = 32
+    distances: int = 64
     bearings: int = 64
     yaws: int = 1
-    latents: int = 8
+    latents: int = 4
 
     def __post_init__(self) -> None:
         if not 0 < self.nearest < self.farthest:

@@ -48,6 +48,7 @@ import dataclasses
 import shlex
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -96,6 +97,8 @@ class Config:
     """Generator steps of the game, after the warm start."""
     near_goal_frames: int = 2_000
     """Size of R, the near-goal frames."""
+    steps_before_goal: int = 80
+    """Frames of R from each rollout, but for its last; what is farther from the goal must be guessed."""
     failed_frames: int = 5_000
     """Frames of failed episodes to paint goals into."""
     out: Path = Path("runs/train_halgan")
@@ -134,7 +137,7 @@ class Config:
         for name in ("near_goal_frames", "failed_frames", "held_out_frames", "evaluate_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)} must be at least 1")
-        for name in ("iterations", "warm_start_steps"):
+        for name in ("iterations", "warm_start_steps", "steps_before_goal"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name}={getattr(self, name)} must not be negative")
         if self.warm_start_steps and self.generator == "paper":
@@ -148,6 +151,7 @@ PRESETS = {
     "default": Config(),
     "paper": Config(
         preset="paper",
+        steps_before_goal=32,
         iterations=50_000,
         failed_frames=10_000,
         generator="paper",
@@ -168,7 +172,8 @@ def main(config: Config) -> None:
     rng = torch.Generator().manual_seed(config.seed)
 
     # Data: near-goal and failed frames, and held-out poses with the truth about them.
-    near_goal = collect(config, envs.collect_near_goal, config.near_goal_frames, config.seed)
+    collect_near_goal = partial(envs.collect_near_goal, steps_before_goal=config.steps_before_goal)
+    near_goal = collect(config, collect_near_goal, config.near_goal_frames, config.seed)
     failed = collect(config, envs.collect_failed, config.failed_frames, config.seed + 1)
     truth = render_truth(config)
 
