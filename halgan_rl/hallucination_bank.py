@@ -27,9 +27,9 @@ class BankGrid:
     which a goal on the floor grows and sinks as it comes near.
 
     Attributes:
-        goal_offset: the goal stands this far ahead of the goal pose [m]. With it, turning the goal pose about the goal
-            changes little but which side of the goal is seen, and few yaws are enough; 0 is right for any goal, but
-            asks for many yaws.
+        goal_offset: the goal stands this far ahead of the goal pose [m]. Turning the goal pose about the goal then
+            changes little but which side of it is seen, and one yaw is enough; with 0 for want of a better one, ask
+            for many yaws.
         nearest: of the goal, from the robot [m]; what is nearer is painted as if it were that far.
         farthest: likewise.
         widest: bearing beyond which the goal is out of sight, to either side [rad]; nothing is painted there.
@@ -42,7 +42,7 @@ class BankGrid:
         ValueError: if a length, angle or count is out of range.
     """
 
-    goal_offset: float = 0.0
+    goal_offset: float
     nearest: float = 0.1
     farthest: float = 6.0
     widest: float = pi / 4
@@ -98,7 +98,7 @@ class HallucinationBank:
 
     A generator's output depends on the relative goal pose and a latent only, never on the image. So it is asked once
     for each cell of a grid, and of its answers only the pixels are kept in which something is to be seen: a sparse
-    matrix with a row for each cell, 8 bits a value. A hallucination is then a lookup, a hundred times as fast.
+    matrix with a row for each cell, 8 bits a value. A hallucination is then a lookup, over twenty times as fast.
 
     The same interface as :class:`~halgan_rl.hallucinators.GanHallucinator`, and the same goal in all images of a row.
 
@@ -118,7 +118,7 @@ class HallucinationBank:
 
     Examples:
         >>> from halgan_rl.models import CoordinateGenerator
-        >>> grid = BankGrid(distances=4, bearings=4, yaws=2, latents=1)
+        >>> grid = BankGrid(goal_offset=0.0, distances=4, bearings=4, yaws=2, latents=1)
         >>> bank = HallucinationBank(CoordinateGenerator(), grid, rng=torch.Generator().manual_seed(0))
         >>> bank(torch.zeros(5, 2, 64, 64, 3, dtype=torch.uint8), torch.zeros(5, 2, 3), torch.ones(5, 1, 3)).shape
         torch.Size([5, 2, 64, 64, 3])

@@ -10,7 +10,7 @@ from halgan_rl.models.coordinates import CoordinateGenerator
 from halgan_rl.models.halgan import PaperGenerator
 from halgan_rl.poses import relative_pose
 
-SMALL = {"distances": 5, "bearings": 7, "yaws": 3, "latents": 2}
+SMALL = {"goal_offset": 0.0, "distances": 5, "bearings": 7, "yaws": 3, "latents": 2}
 
 
 @pytest.fixture
@@ -56,7 +56,7 @@ def test_cells_are_spaced_by_bearing_and_inverse_distance_of_the_goal_itself() -
 
 
 def test_what_is_nearer_or_farther_than_the_grid_is_painted_at_its_edge() -> None:
-    grid = BankGrid(distances=4, bearings=5)
+    grid = BankGrid(goal_offset=0.0, distances=4, bearings=5)
     near, far = grid.cells_at(torch.tensor([[1e-4, 0.0, 0.0], [99.0, 0.0, 0.0]]))[0]
     edges = grid.cells_at(torch.tensor([[grid.nearest, 0.0, 0.0], [grid.farthest, 0.0, 0.0]]))[0]
     assert [near, far] == edges.tolist()
@@ -169,4 +169,4 @@ def test_poses_of_another_size_or_not_finite_are_refused(generator: CoordinateGe
 )
 def test_grids_that_make_no_sense_are_refused(grid: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        BankGrid(**grid)  # type: ignore[arg-type]
+        BankGrid(**({"goal_offset": 0.0} | grid))  # type: ignore[arg-type]

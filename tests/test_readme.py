@@ -6,12 +6,19 @@ from pathlib import Path
 README = Path(__file__).parents[1] / "README.md"
 
 
-def test_the_example_runs_and_relabels_rows() -> None:
-    (example,) = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
-    scope: dict = {}
-    exec(example, scope)
-    scope["env"].close()
-    assert scope["batch"]["goal", "mask"].any()
+def run_examples() -> list[dict]:
+    scopes: list[dict] = []
+    for example in re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL):
+        scopes.append({})
+        exec(example, scopes[-1])
+        scopes[-1]["env"].close()
+    return scopes
+
+
+def test_the_examples_run_relabel_rows_and_fix_a_start() -> None:
+    replay, gymnasium = run_examples()
+    assert replay["batch"]["goal", "mask"].any()
+    assert gymnasium["observation"]["pose"].tolist() == [0, 0, 0.5]
 
 
 def test_every_file_that_is_linked_exists() -> None:
