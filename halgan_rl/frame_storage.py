@@ -5,6 +5,7 @@ import logging
 import os
 import shutil
 from collections.abc import Sequence
+from functools import reduce
 from multiprocessing.context import get_spawning_popen
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,7 +14,7 @@ from typing import Any
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.data import LazyTensorStorage
 from torchrl.data.replay_buffers.checkpointers import StorageCheckpointerBase
@@ -192,6 +193,11 @@ class FrameStorage(LazyTensorStorage):
         """Returns copies of rows, with their frames."""
         if not self.initialized:
             raise RuntimeError("FrameStorage holds no rows yet: write some before reading any")
+        if isinstance(index, Tensor) and index.ndim == 1 and index.dtype == torch.int64:  # as samplers draw it
+            try:
+                return _select(self._columns, index)
+            except IndexError:  # counted from the end, or never written: told apart below
+                pass
         stored = self._storage[: len(self)]
         rows = stored[index]
         if _share_memory(rows.get(self.pixels_key), stored.get(self.pixels_key)):
@@ -309,6 +315,17 @@ class FrameStorage(LazyTensorStorage):
         self.bytes_per_row, self.nbytes = bytes_per_row, nbytes
         self._frame_shape, self._table = shape, FrameTable(frames)
         self._forget_slots()
+        self._columns = self._make_columns()
+
+    def _make_columns(self) -> dict[str, Any]:
+        """Returns the storage's columns, nested like its keys; those of frames give frames instead of their slots."""
+        columns = self._storage.to_dict()
+        frames = self._table.frames.unflatten(1, self._frame_shape)
+        for key in self._keys:
+            *path, name = unravel_key(key) if isinstance(key, tuple) else (key,)
+            parent = reduce(dict.__getitem__, path, columns)
+            parent[name] = _FrameColumn(parent[name], frames)
+        return columns
 
     def _map(self, row: TensorDictBase, slots: int, size: int, folder: Path) -> tuple[TensorDictBase, Tensor]:
         """Maps rows and frames ``[slots, size]`` to files that are gone when this returns, though not their content."""
@@ -389,6 +406,26 @@ class FrameStorage(LazyTensorStorage):
         if get_spawning_popen() is not None:
             raise RuntimeError("FrameStorage belongs to one process: build the buffer in the process that uses it")
         return super().__getstate__()
+
+
+class _FrameColumn:
+    """A column of slots that reads as one of frames ``[slots, ...]``."""
+
+    def __init__(self, slots: Tensor, frames: Tensor) -> None:
+        self.slots, self.frames = slots, frames
+
+    def index_select(self, dim: int, index: Tensor) -> Tensor:
+        """Returns copies of the frames of some rows."""
+        return self.frames.index_select(dim, self.slots.index_select(dim, index))
+
+
+def _select(columns: dict[str, Any], index: Tensor) -> TensorDict:
+    """Returns copies of rows ``[N]``. A third of the time of ``TensorDict.__getitem__``, on the path of every update."""
+    rows = {
+        name: _select(column, index) if type(column) is dict else column.index_select(0, index)
+        for name, column in columns.items()
+    }
+    return TensorDict._new_unsafe(rows, batch_size=index.shape, device=torch.device("cpu"))
 
 
 def _as_tensor(mapped: Tensor) -> Tensor:

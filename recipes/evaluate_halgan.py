@@ -108,12 +108,8 @@ def probe_errors(
 ) -> dict[str, Any]:
     """Compare the probe's errors on held-out real frames and on the same poses painted."""
     data = in_view(near_goal(config, config.frames, config.seed + 1))
-    where = polar(data)
-    images = {
-        "real": data["pixels"],
-        "truth": paint(renderer, data),
-        "hallucinated": paint(painter, without_goal(data, renderer)),
-    }
+    where, empty = polar(data), without_goal(data, renderer)
+    images = {"real": data["pixels"], "truth": paint(renderer, empty), "hallucinated": paint(painter, empty)}
     errors = {label: (probe_all(probe, frames) - where).abs().mean(0) for label, frames in images.items()}
     table = {
         label: {"bearing_degrees": float(error[0].rad2deg()), "distance_metres": float(error[1])}
@@ -162,10 +158,11 @@ def consistency(
     """Return how far the goal seems to wander in the room while the robot moves [m], the root mean square."""
     squares: dict[str, list[Tensor]] = {"real": [], "truth": [], "hallucinated": []}
     for stretch in stretches(near_goal(config, config.frames, config.seed + 2)):
+        empty = without_goal(stretch, renderer)
         images = {
             "real": stretch["pixels"],
-            "truth": paint_one(renderer, stretch),
-            "hallucinated": paint_one(painter, without_goal(stretch, renderer)),
+            "truth": paint_one(renderer, empty),
+            "hallucinated": paint_one(painter, empty),
         }
         for label, frames in images.items():
             seen = in_room(stretch["pose"], probe_all(probe, frames))

@@ -242,10 +242,10 @@ def render_truth(config: Config) -> dict[str, Tensor]:
     data = collect(config, envs.collect_near_goal, 8 * config.held_out_frames, HELD_OUT_SEED)
     data = {name: tensor[::8] for name, tensor in data.items()}
     renderer = envs.GoalRenderer(config.environment)
-    empty = np.stack([renderer.render_without_goal(pose) for pose in data["pose"].double().numpy()])
-    truth = renderer(*(data[name].unsqueeze(1) for name in ("pixels", "pose", "goal_pose"))).squeeze(1)
+    data["empty"] = torch.from_numpy(np.stack([renderer.render_without_goal(pose) for pose in data["pose"].numpy()]))
+    data["truth"] = renderer(*(data[name].unsqueeze(1) for name in ("empty", "pose", "goal_pose"))).squeeze(1)
     renderer.close()
-    return data | {"empty": torch.from_numpy(empty), "truth": truth}
+    return data
 
 
 def make_generator(config: Config) -> HallucinationGenerator:
