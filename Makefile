@@ -1,6 +1,7 @@
 # Everything here works on a fresh machine with Python >= 3.11, git, make and an EGL driver.
 PYTHON ?= python3
 VENV ?= .venv
+BENCH_VENV ?= .venv-bench
 BIN := $(VENV)/bin
 SEED ?= 0
 HINDSIGHT ?= halgan
@@ -26,9 +27,9 @@ format: $(VENV)/ready
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: $(VENV)/ready  ## speed, side by side with the stock camera
-	$(BIN)/python benchmarks/env_speed.py
-	$(BIN)/python -m benchmarks.update_cost
+bench: $(BENCH_VENV)/ready  ## speed and memory side by side with the peers, in an environment of their own; ten minutes
+	for benchmark in env_speed replay updates update_cost; do \
+	  $(BENCH_VENV)/bin/python -m benchmarks.$$benchmark || exit 1; done
 
 weights: $(VENV)/ready  ## train the shipped generators again (a few minutes)
 	for environment in navigate-2m navigate-4m; do \
@@ -44,5 +45,11 @@ $(VENV)/ready: pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@
 
+$(BENCH_VENV)/ready: pyproject.toml constraints.txt benchmarks/requirements-peers.txt
+	$(PYTHON) -m venv $(BENCH_VENV)
+	$(BENCH_VENV)/bin/python -m pip install --quiet --constraint constraints.txt torch
+	$(BENCH_VENV)/bin/python -m pip install --quiet --constraint constraints.txt --requirement benchmarks/requirements-peers.txt --editable .
+	touch $@
+
 clean:
-	rm -rf $(VENV) build *.egg-info
+	rm -rf $(VENV) $(BENCH_VENV) build *.egg-info

@@ -1,6 +1,6 @@
 """Steps and frames a second of the environment, beside dm_control's stock camera in the same scene.
 
-Usage: python benchmarks/env_speed.py [--name navigate-2m] [--steps 500] [--rounds 5]
+Usage: python -m benchmarks.env_speed [--name navigate-2m] [--steps 500] [--rounds 5]
 
 Every measurement runs in a process of its own (OpenGL contexts of different kinds do not mix), the variants by turns,
 so that what else the machine does falls on all of them. The table shows medians, by wall time and by processor time,
@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 import envs
+from benchmarks.tables import Table, report
 from envs.environment import Environment
 
 
@@ -84,7 +85,17 @@ def measure(variant: str, name: str, steps: int) -> tuple[float, float]:
 
 def measure_elsewhere(variant: str, name: str, steps: int) -> tuple[float, float]:
     """The same in a process of its own."""
-    command = [sys.executable, __file__, "--name", name, "--steps", str(steps), "--variant", variant]
+    command = [
+        sys.executable,
+        "-m",
+        "benchmarks.env_speed",
+        "--name",
+        name,
+        "--steps",
+        str(steps),
+        "--variant",
+        variant,
+    ]
     output = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
     wall, processor = output.split()[-2:]
     return float(wall), float(processor)
@@ -105,20 +116,23 @@ def main() -> None:
     for _ in range(flags.rounds):
         for variant, values in results.items():
             values.append(measure_elsewhere(variant, flags.name, flags.steps))
-    print_table(flags.name, results)
+    report("env_speed", [make_table(flags.name, results)])
 
 
-def print_table(name: str, results: dict[str, list[tuple[float, float]]]) -> None:
-    """Medians, spread, and the ratio to the stock camera."""
+def make_table(name: str, results: dict[str, list[tuple[float, float]]]) -> Table:
+    """Return medians, spread, and the ratio to the stock camera."""
     wall = {variant: [value[0] for value in values] for variant, values in results.items()}
     processor = {variant: statistics.median(value[1] for value in values) for variant, values in results.items()}
-    print(f"{name}, 64x64 pixels, {envs.gl_backend.VARIABLE}={envs.fingerprint(name)['gl']}, one process\n")
-    print("| variant | steps/s | lowest to highest | steps per processor second | ratio to stock |")
-    print("|---|---|---|---|---|")
+    title = f"{name}, 64x64 pixels, {envs.gl_backend.VARIABLE}={envs.fingerprint(name)['gl']}, one process"
+    header = ("variant", "steps/s", "lowest to highest", "steps per processor second", "ratio to stock")
+    lines = []
     for variant, values in wall.items():
         ratio = processor[variant] / processor["stock composer camera"]
         spread = f"{min(values):,.0f} to {max(values):,.0f}"
-        print(f"| {variant} | {statistics.median(values):,.0f} | {spread} | {processor[variant]:,.0f} | {ratio:.1f} |")
+        lines.append(
+            [variant, f"{statistics.median(values):,.0f}", spread, f"{processor[variant]:,.0f}", f"{ratio:.1f}"]
+        )
+    return Table(title, header, lines)
 
 
 if __name__ == "__main__":

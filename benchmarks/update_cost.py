@@ -2,18 +2,17 @@
 
 Usage::
 
-    python -m benchmarks.update_cost   # one thread, the recipe's batch
+    python -m benchmarks.update_cost   # the recipe's batch
 
 Times one update of the recipe (sample, loss, backward, both optimizer steps, target update) with no hindsight, with
 HALGAN looked up in the bank, with its generator itself and with the simulator as oracle, at the share of relabelled
-rows that the recipe starts from and at its mean over a run. Medians of alternating rounds; quote the ratios, machines
-are noisy.
+rows that the recipe starts from and at its mean over a run. Medians of processor time in alternating rounds; quote the
+ratios, machines are noisy.
 """
 
 import dataclasses
-import statistics
-import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -22,6 +21,8 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import envs
+from benchmarks.rounds import alternate, seconds_a_call, warm_heap
+from benchmarks.tables import Table, report
 from recipes.ddpg_navigate import (
     Config,
     make_agent,
@@ -44,8 +45,6 @@ PAINTERS: dict[str, dict[str, Any]] = {
 class Benchmark:
     """What hallucination costs a DDPG update."""
 
-    threads: int = 1
-    """Threads of PyTorch."""
     rounds: int = 7
     """Alternating rounds; the median is reported."""
     updates: int = 20
@@ -68,22 +67,11 @@ def make_update(config: Config, rollout: TensorDict) -> Callable[[], object]:
     return lambda: update(buffer.sample(), loss, optimizer, updater)
 
 
-def median_milliseconds(updates: dict[str, Callable[[], object]], benchmark: Benchmark) -> dict[str, float]:
-    """Time all updates in alternating rounds."""
-    times: dict[str, list[float]] = {name: [] for name in updates}
-    for _ in range(benchmark.rounds + 1):
-        for name, run in updates.items():
-            started = time.perf_counter()
-            for _ in range(benchmark.updates):
-                run()
-            times[name].append((time.perf_counter() - started) / benchmark.updates * 1e3)
-    return {name: statistics.median(values[1:]) for name, values in times.items()}  # the first round warms up
-
-
 def main(benchmark: Benchmark) -> None:
     """Print the table."""
-    torch.set_num_threads(benchmark.threads)
+    torch.set_num_threads(1)
     torch.manual_seed(0)
+    warm_heap()
     default = Config()
     env = envs.make(default.environment, seed=0)
     rollout = env.rollout(benchmark.rows, break_when_any_done=False)
@@ -94,11 +82,17 @@ def main(benchmark: Benchmark) -> None:
         for share in (default.hallucination_start, mean_share):
             config = dataclasses.replace(default, hallucination_start=share, **changes)
             updates[f"{name}, {share:.1%} relabelled"] = make_update(config, rollout)
-    milliseconds = median_milliseconds(updates, benchmark)
-    print(f"batch {default.batch_size}, {benchmark.threads} thread(s), medians of {benchmark.rounds} rounds")
-    print(f"{'':28s} {'ms an update':>12s} {'share of it':>12s} {'ratio':>7s}")
-    for name, value in milliseconds.items():
-        print(f"{name:28s} {value:12.1f} {1 - milliseconds['none'] / value:12.1%} {value / milliseconds['none']:7.2f}")
+    measures = {name: partial(seconds_a_call, run, benchmark.updates) for name, run in updates.items()}
+    seconds = alternate(measures, benchmark.rounds)
+    title = (
+        f"Hallucination in a DDPG update, batch {default.batch_size}, one thread, medians of {benchmark.rounds} "
+        f"alternating rounds of {benchmark.updates}, processor time."
+    )
+    lines = [
+        [name, f"{value * 1e3:.1f}", f"{1 - seconds['none'] / value:.1%}", f"{value / seconds['none']:.2f}"]
+        for name, value in seconds.items()
+    ]
+    report("update_cost", [Table(title, ("painter", "ms an update", "share of it", "ratio to none"), lines)])
 
 
 if __name__ == "__main__":

@@ -24,6 +24,8 @@ from halgan_rl.transforms.base import dotted, next_key
 
 _LOGGER = logging.getLogger(__name__)
 
+_MEMORY = torch.device("cpu")
+
 CHUNK = 1_024
 """Rows of a checkpoint that are restored at a time."""
 
@@ -420,12 +422,12 @@ class _FrameColumn:
 
 
 def _select(columns: dict[str, Any], index: Tensor) -> TensorDict:
-    """Returns copies of rows ``[N]``. A third of the time of ``TensorDict.__getitem__``, on the path of every update."""
+    """Returns copies of rows ``[N]``, several times as fast as indexing the TensorDict: every update waits for it."""
     rows = {
         name: _select(column, index) if type(column) is dict else column.index_select(0, index)
         for name, column in columns.items()
     }
-    return TensorDict._new_unsafe(rows, batch_size=index.shape, device=torch.device("cpu"))
+    return TensorDict._new_unsafe(rows, batch_size=index.shape, device=_MEMORY)
 
 
 def _as_tensor(mapped: Tensor) -> Tensor:

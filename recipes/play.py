@@ -10,6 +10,7 @@ import dataclasses
 from functools import partial
 from pathlib import Path
 
+import torch
 import tyro
 
 import envs
@@ -38,6 +39,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Evaluate the policy of a run, and film it if asked to."""
+    torch.set_num_threads(1)  # as in training: more do not help networks this small
     path = config.run / "policy.safetensors"
     network, manifest = load_module(path, Actor)
     policy = deterministic_policy(network)

@@ -1,0 +1,36 @@
+"""Timing by turns: what else the machine does falls on all variants alike."""
+
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from typing import TypeVar
+
+import torch
+
+Name = TypeVar("Name")
+
+
+def warm_heap(size: int = 32 << 20) -> None:
+    """Take and give back a block of memory.
+
+    From then on glibc keeps what tensors of up to this size [bytes] give back, as it does in a training, instead of
+    returning it to the system and faulting it in again at each sample.
+    """
+    torch.empty(size - (1 << 16), dtype=torch.uint8).fill_(0)
+
+
+def seconds_a_call(run: Callable[[], object], calls: int) -> float:
+    """Return processor time [s] of one call, a mean over some; on one thread it is wall time less others' share."""
+    started = time.process_time()
+    for _ in range(calls):
+        run()
+    return (time.process_time() - started) / calls
+
+
+def alternate(measures: Mapping[Name, Callable[[], float]], rounds: int) -> dict[Name, float]:
+    """Take each measure by turns, in ``rounds`` rounds after one to warm up; return the medians."""
+    values: dict[Name, list[float]] = {name: [] for name in measures}
+    for _ in range(rounds + 1):
+        for name, measure in measures.items():
+            values[name].append(measure())
+    return {name: statistics.median(measured[1:]) for name, measured in values.items()}

@@ -1,0 +1,158 @@
+"""Stable-Baselines3's buffers and DDPG, on the same rows and networks."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3 import DDPG
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from benchmarks.rows import EPISODE, channels_first
+from halgan_rl.models.agents import Vision
+from halgan_rl.models.halgan import LEAK
+
+ACTIONS = spaces.Box(-1, 1, (2,), np.float32)
+POSES = spaces.Box(-np.inf, np.inf, (3,), np.float32)
+TOLERANCE = 0.01
+"""A goal is reached within this distance [m]."""
+
+
+class Still(gymnasium.Env):
+    """An environment that is never stepped: it has spaces, and rewards poses that are their goal."""
+
+    def __init__(self, observation_space: spaces.Space) -> None:
+        self.observation_space, self.action_space = observation_space, ACTIONS
+
+    def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, _info: Any) -> np.ndarray:
+        """Return 1 where the goal is reached."""
+        return (np.linalg.norm(achieved_goal - desired_goal, axis=-1) < TOLERANCE).astype(np.float32)
+
+
+def images(side: int) -> spaces.Box:
+    """Return the space of images, channels first as Stable-Baselines3 wants them."""
+    return spaces.Box(0, 255, (3, side, side), np.uint8)
+
+
+def make_buffer(rows: int, side: int, **options: Any) -> ReplayBuffer:
+    """Return a ``ReplayBuffer`` for one environment."""
+    return ReplayBuffer(rows, images(side), ACTIONS, device="cpu", **options)
+
+
+def make_her_buffer(rows: int, side: int) -> HerReplayBuffer:
+    """Return a ``HerReplayBuffer`` with its defaults: 80 % of a sample get a later pose as their goal."""
+    space = spaces.Dict({"observation": images(side), "achieved_goal": POSES, "desired_goal": POSES})
+    env = DummyVecEnv([partial(Still, space)])
+    return HerReplayBuffer(rows, space, ACTIONS, env=env, device="cpu")
+
+
+Transition = tuple[Any, Any, np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]
+
+
+def transitions(rows: TensorDict, *, goals: bool) -> list[Transition]:
+    """Return the arguments of ``add``, row by row."""
+    before, after = (_observations(part, goals=goals) for part in (rows, rows["next"]))
+    actions, rewards = rows["action"].numpy(), rows["next", "reward"].numpy()
+    dones = rows["next", "done"].numpy()
+    infos = [{"TimeLimit.truncated": bool(done)} for done in dones]
+    return [
+        (_pick(before, i), _pick(after, i), actions[i : i + 1], rewards[i], dones[i], infos[i : i + 1])
+        for i in range(len(rows))
+    ]
+
+
+def _observations(rows: TensorDict, *, goals: bool) -> dict[str, np.ndarray]:
+    observations = {"observation": channels_first(rows["pixels"]).numpy()}
+    if goals:
+        observations |= {"achieved_goal": rows["pose"].numpy(), "desired_goal": np.full_like(rows["pose"], 9.0)}
+    return observations
+
+
+def _pick(observations: dict[str, np.ndarray], place: int) -> Any:
+    picked = {name: values[place : place + 1] for name, values in observations.items()}
+    return picked if len(picked) > 1 else picked["observation"]
+
+
+def add(buffer: ReplayBuffer, rows: list[Transition]) -> None:
+    """Add transitions one by one: there is one environment."""
+    for row in rows:
+        buffer.add(*row)
+
+
+def fill(buffer: ReplayBuffer, rows: TensorDict) -> None:
+    """Write rows that are whole episodes into the arrays, as ``add`` would: a million calls would take minutes."""
+    goals = isinstance(buffer, HerReplayBuffer)
+    start, stop = buffer.pos, buffer.pos + len(rows)
+    for target, part in ((buffer.observations, rows), (getattr(buffer, "next_observations", None), rows["next"])):
+        observations = _observations(part, goals=goals)
+        if goals:
+            for name, values in observations.items():
+                target[name][start:stop, 0] = values
+        elif target is not None:
+            target[start:stop, 0] = observations["observation"]
+    buffer.actions[start:stop, 0] = rows["action"].numpy()
+    buffer.dones[start:stop] = buffer.timeouts[start:stop] = rows["next", "done"].numpy()
+    if goals:
+        buffer.ep_start[start:stop, 0] = np.arange(start, stop) // EPISODE * EPISODE
+        buffer.ep_length[start:stop] = EPISODE
+    buffer.full, buffer.pos = stop == buffer.buffer_size, stop % buffer.buffer_size
+
+
+def nbytes(buffer: ReplayBuffer) -> int:
+    """Return the size of all its arrays [bytes], without the empty infos of hindsight."""
+    total = 0
+    for name, value in vars(buffer).items():
+        arrays = value.values() if isinstance(value, dict) else [value]
+        total += sum(array.nbytes for array in arrays if isinstance(array, np.ndarray) and name != "infos")
+    return total
+
+
+class Features(BaseFeaturesExtractor):
+    """The convolutions of :class:`halgan_rl.models.agents.Vision`, in PyTorch's default memory format."""
+
+    def __init__(self, observation_space: spaces.Box, downsample: str) -> None:
+        super().__init__(observation_space, features_dim=512)
+        self.layers = Vision(downsample).layers.to(memory_format=torch.contiguous_format)
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """Return features ``[N, 512]``."""
+        return self.layers(observations)
+
+
+def make_ddpg(rows: int, *, downsample: str, learning_rate: float, discount: float, target_rate: float) -> DDPG:
+    """Return DDPG with our networks, its own for each of actor and critic, on a buffer of images 64x64."""
+    model = DDPG(
+        "CnnPolicy",
+        DummyVecEnv([partial(Still, images(64))]),
+        learning_rate=learning_rate,
+        buffer_size=rows,
+        tau=target_rate,
+        gamma=discount,
+        device="cpu",
+        policy_kwargs={
+            "features_extractor_class": Features,
+            "features_extractor_kwargs": {"downsample": downsample},
+            "share_features_extractor": False,
+            "net_arch": [32],
+            "activation_fn": partial(nn.LeakyReLU, LEAK),
+        },
+    )
+    model.set_logger(Logger(folder=None, output_formats=[]))
+    return model
+
+
+def make_update(rows: TensorDict, batch_size: int, **options: Any) -> tuple[Callable[[], object], tuple[int, int]]:
+    """Return an update of DDPG, and the numbers of parameters of actor and critic."""
+    model = make_ddpg(len(rows), **options)
+    fill(model.replay_buffer, rows)
+    counts = tuple(sum(p.numel() for p in network.parameters()) for network in (model.actor, model.critic))
+    return partial(model.train, gradient_steps=1, batch_size=batch_size), counts

@@ -1,0 +1,73 @@
+import json
+
+import pytest
+import torch
+
+pytest.importorskip("stable_baselines3", reason="the peers live in an environment of their own: make bench")
+
+from benchmarks import replay, sb3_peers, update_cost, updates
+from benchmarks.rounds import alternate
+from benchmarks.rows import EPISODE, Rows, channels_first, plain
+from benchmarks.tables import Table, report
+from halgan_rl.frame_storage import FrameStorage
+
+TINY = replay.Benchmark(rounds=1, calls=1)
+
+
+def test_frames_are_shared_by_neighbours_and_by_no_other_rows():
+    rows = Rows(8).take(2 * EPISODE)
+    storage = FrameStorage(len(rows))
+    storage.set(range(len(rows)), plain(rows))
+    assert storage.frames_kept == 2 * (EPISODE + 1)
+
+
+def test_filling_a_peers_arrays_does_what_adding_does():
+    rows, filled, added = Rows(8).take(2 * EPISODE), *(sb3_peers.make_her_buffer(2 * EPISODE, 8) for _ in range(2))
+    sb3_peers.fill(filled, rows)
+    sb3_peers.add(added, sb3_peers.transitions(rows, goals=True))
+    for name in ("ep_start", "ep_length", "actions", "rewards", "dones", "timeouts"):
+        assert (getattr(filled, name) == getattr(added, name)).all(), name
+    for name, values in filled.next_observations.items():
+        assert (values == added.next_observations[name]).all(), name
+    assert (filled.next_observations["observation"][:, 0] == channels_first(rows["next", "pixels"]).numpy()).all()
+    assert (filled.pos, filled.full) == (added.pos, added.full)
+
+
+def test_replay_compares_every_buffer_at_every_size():
+    lines = replay.compare(8, (2 * EPISODE, 3 * EPISODE), TINY)
+    assert len(lines) == 2 * (2 + 5)
+    assert {len(line) for line in lines} == {len(replay.HEADER)}
+
+
+def test_updates_run_on_networks_of_the_same_size():
+    config = updates.Config(hindsight="none", replay_capacity=EPISODE)
+    for run in updates.make_updates(config, Rows(64).take(EPISODE)).values():
+        run()
+
+
+def test_different_networks_are_refused(monkeypatch):
+    monkeypatch.setitem(updates.VARIANTS, "ours", lambda config, rows: (lambda: None, (1, 2)))
+    with pytest.raises(RuntimeError, match="the networks differ"):
+        updates.make_updates(updates.Config(hindsight="none"), Rows(64).take(EPISODE))
+
+
+def test_the_cost_of_hindsight_is_measured_on_the_recipes_update():
+    config = update_cost.Config(hindsight="none", batch_size=4, replay_capacity=EPISODE)
+    update_cost.make_update(config, Rows(64).take(EPISODE))()
+
+
+def test_rounds_alternate_and_the_first_does_not_count():
+    order = []
+    values = {"a": iter([9.0, 1.0, 2.0, 6.0]), "b": iter([0.0, 3.0, 4.0, 5.0])}
+    measures = {name: lambda name=name: order.append(name) or next(values[name]) for name in values}
+    assert alternate(measures, rounds=3) == {"a": 2.0, "b": 4.0}
+    assert order == ["a", "b"] * 4
+
+
+def test_a_saved_table_names_versions_but_no_machine(tmp_path, capsys):
+    report("speed", [Table("Speed.", ("what", "steps/s"), [["ours", "7"]])], tmp_path)
+    saved = json.loads((tmp_path / "speed.json").read_text())
+    assert saved["tables"][0]["rows"] == [["ours", "7"]]
+    assert saved["machine"].keys() == {"cpus", "python", "torch", "torchrl"}
+    assert saved["machine"]["torch"].split("+")[0] == torch.__version__.split("+")[0]
+    assert "| ours | 7 |" in capsys.readouterr().out
