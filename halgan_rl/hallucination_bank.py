@@ -133,9 +133,11 @@ class HallucinationBank:
         self.cells = grid.latents * self._flags * grid.cells
         was_training = generator.training
         generator.eval()
-        self._check_composition()
-        self._tabulate(chunk)
-        generator.train(was_training)
+        try:
+            self._check_composition()
+            self._tabulate(chunk)
+        finally:
+            generator.train(was_training)
 
     @property
     def nbytes(self) -> int:
@@ -220,5 +222,6 @@ class HallucinationBank:
         if not torch.allclose(generator.compose(image, torch.zeros_like(change[..., :1, :1])), image):
             raise ValueError(
                 f"{type(generator).__name__} changes pixels where it paints nothing, all of which a bank would have to "
-                'keep: use one that is the identity there, such as the paper\'s with composition="difference"'
+                'keep: use one that is the identity there, such as the paper\'s with composition="difference", or ask '
+                "the generator each time (GanHallucinator; --no-bank in the recipes)"
             )

@@ -128,6 +128,7 @@ def mask_overlaps(
     seen = fidelity.changed(frames, truth).flatten(1).any(1)
 
     def judge(rows: Tensor) -> dict[str, float]:
+        """Compare the masks in some of the frames; NaN if there are none."""
         figures = fidelity.compare(frames[rows], truth[rows], painted[rows]) if rows.any() else None
         return {"overlap": figures.mask_overlap if figures else float("nan"), "frames": int(rows.sum())}
 

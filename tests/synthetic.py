@@ -3,7 +3,18 @@
 import torch
 from torch import Tensor
 
+from halgan_rl.models.coordinates import CoordinateGenerator
 from halgan_rl.poses import relative_pose
+
+
+def vivid_generator(pose_size: int = 3) -> CoordinateGenerator:
+    """Return an untrained generator in whose images pose and latent show in 8 bits."""
+    torch.manual_seed(0)
+    generator = CoordinateGenerator(pose_size=pose_size, opacity=0.5)
+    with torch.no_grad():
+        for parameter in generator.parameters():
+            parameter.mul_(2)
+    return generator
 
 
 def near_goal(count: int = 64, frames_per_rollout: int = 8, seed: int = 0) -> dict[str, Tensor]:

@@ -9,18 +9,14 @@ from halgan_rl.hallucinators import GanHallucinator
 from halgan_rl.models.coordinates import CoordinateGenerator
 from halgan_rl.models.halgan import PaperGenerator
 from halgan_rl.poses import relative_pose
+from tests.synthetic import vivid_generator
 
 SMALL = {"goal_offset": 0.0, "distances": 5, "bearings": 7, "yaws": 3, "latents": 2}
 
 
 @pytest.fixture
 def generator() -> CoordinateGenerator:
-    torch.manual_seed(0)
-    generator = CoordinateGenerator(opacity=0.5)
-    with torch.no_grad():
-        for parameter in generator.parameters():  # so that pose and latent show in 8 bits
-            parameter.mul_(2)
-    return generator
+    return vivid_generator()
 
 
 def random_source(seed: int = 0) -> torch.Generator:
@@ -108,12 +104,7 @@ def test_given_frames_stay(generator: CoordinateGenerator) -> None:
 
 
 def test_flags_of_the_pose_choose_what_is_painted() -> None:
-    torch.manual_seed(0)
-    generator = CoordinateGenerator(pose_size=4, opacity=0.5)
-    with torch.no_grad():
-        for parameter in generator.parameters():
-            parameter.mul_(2)
-    bank = make(generator, latents=1)
+    bank = make(vivid_generator(pose_size=4), latents=1)
     frames = random_frames(1, 1).expand(2, 1, -1, -1, -1)
     pose = torch.tensor([[[0.0, 0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0, 1.0]]])
     painted = bank(frames, pose, torch.tensor([[0.5, 0.0, 0.0, 1.0]]).expand(2, 1, 4))
@@ -144,8 +135,10 @@ def test_the_papers_generator_fits_if_it_paints_differences(training: bool) -> N
 
 
 def test_a_generator_that_dims_the_whole_image_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"changes pixels where it paints nothing.*difference"):
-        make(PaperGenerator())
+    generator = PaperGenerator().train()
+    with pytest.raises(ValueError, match=r"changes pixels where it paints nothing.*difference.*--no-bank"):
+        make(generator)
+    assert generator.training
 
 
 def test_poses_of_another_size_or_not_finite_are_refused(generator: CoordinateGenerator) -> None:

@@ -5,18 +5,14 @@ from torch import Tensor
 from halgan_rl.hallucinators import GanHallucinator
 from halgan_rl.models.coordinates import CoordinateGenerator
 from halgan_rl.models.halgan import PaperGenerator
+from tests.synthetic import vivid_generator
 
 ROWS, FRAMES = 3, 2
 
 
 @pytest.fixture
 def generator() -> CoordinateGenerator:
-    torch.manual_seed(0)
-    generator = CoordinateGenerator(opacity=0.5)
-    with torch.no_grad():
-        for parameter in generator.parameters():  # so that pose and latent show in 8 bits
-            parameter.mul_(2)
-    return generator
+    return vivid_generator()
 
 
 @pytest.fixture

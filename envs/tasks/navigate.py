@@ -94,8 +94,8 @@ class Navigate(composer.Task):
             )
 
     def _check_room(self) -> None:
-        farthest = np.sqrt(2) * (max(self._robot_range, 0) + max(self.box_range, 0))
-        if min(self._robot_range, self.box_range) <= 0 or self.min_start_distance > 0.75 * farthest:
+        farthest = np.sqrt(2) * (max(self._robot_range, 0) + max(self._box_range, 0))
+        if min(self._robot_range, self._box_range) <= 0 or self.min_start_distance > 0.75 * farthest:
             raise ValueError(
                 f"A room of {self.arena.size} m is too small for min_start_distance={self.min_start_distance} m: "
                 "use a larger room or a smaller distance."
@@ -107,8 +107,8 @@ class Navigate(composer.Task):
         return self.arena.size / 2 - self.rover.radius - _WALL_CLEARANCE
 
     @property
-    def box_range(self) -> float:
-        """Largest |x| and |y| of the box [m]: the robot can stand before any side of it."""
+    def _box_range(self) -> float:
+        # Far enough from the walls that the robot can stand before any side of it.
         return self.arena.size / 2 - self.success_distance - self.rover.radius
 
     @property
@@ -182,7 +182,7 @@ class Navigate(composer.Task):
             return pose, box
         for _ in range(_MAX_DRAWS):
             robot = random_state.uniform(-self._robot_range, self._robot_range, size=2) if pose is None else pose[:2]
-            position = random_state.uniform(-self.box_range, self.box_range, size=2) if box is None else box
+            position = random_state.uniform(-self._box_range, self._box_range, size=2) if box is None else box
             if np.hypot(*(robot - position)) >= self.min_start_distance:
                 yaw = random_state.uniform(-np.pi, np.pi) if pose is None else pose[2]
                 return np.array([*robot, yaw]), position
