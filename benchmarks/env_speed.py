@@ -85,17 +85,8 @@ def measure(variant: str, name: str, steps: int) -> tuple[float, float]:
 
 def measure_elsewhere(variant: str, name: str, steps: int) -> tuple[float, float]:
     """The same in a process of its own."""
-    command = [
-        sys.executable,
-        "-m",
-        "benchmarks.env_speed",
-        "--name",
-        name,
-        "--steps",
-        str(steps),
-        "--variant",
-        variant,
-    ]
+    flags = {"--name": name, "--steps": str(steps), "--variant": variant}
+    command = [sys.executable, "-m", "benchmarks.env_speed", *(part for flag in flags.items() for part in flag)]
     output = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
     wall, processor = output.split()[-2:]
     return float(wall), float(processor)

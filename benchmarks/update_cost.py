@@ -18,7 +18,6 @@ from typing import Any
 import torch
 import tyro
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import envs
 from benchmarks.rounds import alternate, seconds_a_call, warm_heap
@@ -26,6 +25,7 @@ from benchmarks.tables import Table, report
 from recipes.ddpg_navigate import (
     Config,
     make_agent,
+    make_buffer,
     make_hallucinator,
     make_hindsight,
     make_loss,
@@ -55,12 +55,8 @@ class Benchmark:
 
 def make_update(config: Config, rollout: TensorDict) -> Callable[[], object]:
     """Return one update of the recipe on a buffer of its own."""
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(len(rollout)),
-        batch_size=config.batch_size,
-        transform=make_hindsight(config, make_hallucinator(config)),
-        generator=torch.Generator().manual_seed(0),
-    )
+    config = dataclasses.replace(config, replay_capacity=len(rollout))
+    buffer = make_buffer(config, make_hindsight(config, make_hallucinator(config)))
     buffer.extend(rollout.clone())
     loss, updater = make_loss(config, *make_agent(config, action_size=2))
     optimizer = make_optimizer(config, loss)

@@ -65,10 +65,6 @@ class FrameTable:
         self._freed: list[int] = []
         self.used = 0
 
-    def gather(self, slots: Tensor) -> Tensor:
-        """Returns copies of the frames in ``slots``, int64 ``[...]``, as uint8 ``[..., bytes]``."""
-        return gather(self.frames, slots)
-
     def exchange(self, frames: Tensor, dropped: Tensor | None = None) -> Tensor:
         """Takes a reference to each of ``frames`` and drops one to each slot of ``dropped``.
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from halgan_rl import frame_table
-from halgan_rl.frame_table import OVERHEAD, FrameTable, FrameTableFullError
+from halgan_rl.frame_table import OVERHEAD, FrameTable, FrameTableFullError, gather
 
 
 def frames(*numbers: int) -> Tensor:
@@ -33,8 +33,8 @@ def test_a_frame_stays_until_its_last_reference_is_dropped() -> None:
     assert len(kept) == 2
     kept.exchange(frames(), dropped=torch.tensor([0]))
     assert len(kept) == 1
-    assert torch.equal(kept.gather(kept.exchange(frames(8))), frames(8))
-    assert torch.equal(kept.gather(torch.tensor([1])), frames(6))
+    assert torch.equal(gather(kept.frames, kept.exchange(frames(8))), frames(8))
+    assert torch.equal(gather(kept.frames, torch.tensor([1])), frames(6))
 
 
 def test_a_frame_that_is_dropped_and_taken_at_once_keeps_its_slot() -> None:
@@ -47,7 +47,7 @@ def test_a_frame_that_is_dropped_and_taken_at_once_keeps_its_slot() -> None:
 def test_a_dropped_frame_makes_room_in_the_same_exchange() -> None:
     kept = table(1)
     slot = kept.exchange(frames(5))
-    assert torch.equal(kept.gather(kept.exchange(frames(6), dropped=slot)), frames(6))
+    assert torch.equal(gather(kept.frames, kept.exchange(frames(6), dropped=slot)), frames(6))
 
 
 def test_a_full_table_names_what_it_lacks_and_stays_as_it_was() -> None:
@@ -56,7 +56,7 @@ def test_a_full_table_names_what_it_lacks_and_stays_as_it_was() -> None:
     with pytest.raises(FrameTableFullError, match="lacks 2 slots") as error:
         kept.exchange(frames(1, 2, 3, 4, 6), dropped=slots[:1])
     assert error.value.missing == 2
-    assert torch.equal(kept.gather(slots), frames(5, 6))
+    assert torch.equal(gather(kept.frames, slots), frames(5, 6))
     kept.exchange(frames(), dropped=slots)
     assert len(kept) == 0
 
@@ -64,7 +64,7 @@ def test_a_full_table_names_what_it_lacks_and_stays_as_it_was() -> None:
 def test_gathered_frames_are_copies_of_the_slots_shape() -> None:
     kept = table(2)
     kept.exchange(frames(5, 6))
-    gathered = kept.gather(torch.tensor([[0, 1], [1, 1]]))
+    gathered = gather(kept.frames, torch.tensor([[0, 1], [1, 1]]))
     assert torch.equal(gathered, frames(5, 6, 6, 6).view(2, 2, 3))
     gathered.zero_()
     assert torch.equal(kept.frames, frames(5, 6))
@@ -102,7 +102,8 @@ def test_references_always_find_their_frames_even_if_hashes_collide(
             slots = kept.exchange(frames(*numbers), dropped=torch.tensor([slot for slot, _ in dropped]).long())
             held += zip(slots.tolist(), numbers, strict=True)
             assert torch.equal(
-                kept.gather(torch.tensor([slot for slot, _ in held]).long()), frames(*(number for _, number in held))
+                gather(kept.frames, torch.tensor([slot for slot, _ in held]).long()),
+                frames(*(number for _, number in held)),
             )
             if hash_function is hash:
                 assert len(kept) == len({number for _, number in held})
