@@ -8,12 +8,15 @@ from torch import Tensor
 
 from halgan_rl.hallucinators import check_poses
 from halgan_rl.models.halgan import HallucinationGenerator
-from halgan_rl.models.pixels import to_float, to_uint8
 from halgan_rl.poses import relative_pose
+from halgan_rl.rows import replace_rows
 
 VISIBLE = 2
-"""A pixel is kept if it changes a black or a white image by more than this [levels of 255]."""
+"""A line of the image is stored if it changes a black or a white image by more than this [levels of 255]."""
 
+SHIFT = 7
+WHOLE = 1 << SHIFT
+"""A share of 1: the largest that leaves its product with a pixel's level within 16 bits."""
 
 BLOCK = 512
 """Cells whose whole images are held at a time."""
@@ -97,8 +100,9 @@ class HallucinationBank:
     """Paints goals by looking up what a generator painted before.
 
     A generator's output depends on the relative goal pose and a latent only, never on the image. So it is asked once
-    for each cell of a grid, and of its answers only the pixels are kept in which something is to be seen: a sparse
-    matrix with a row for each cell, 8 bits a value. A hallucination is then a lookup, over twenty times as fast.
+    for each cell of a grid. Its answers are mattes: each pixel keeps a share of what it was, and something is added.
+    Of these only the image lines are stored in which something is to be seen, 8 bits a value. A hallucination is then
+    a lookup and a little integer arithmetic.
 
     The same interface as :class:`~halgan_rl.hallucinators.GanHallucinator`, and the same goal in all images of a row.
 
@@ -113,8 +117,8 @@ class HallucinationBank:
         nbytes: size of the table [bytes].
 
     Raises:
-        ValueError: if the generator changes pixels where it paints nothing, as tanh(s + H) does; and, when called, if
-            poses have another size than those that the network was trained with, or are not finite.
+        ValueError: if the generator's ``compose`` is no matte, as tanh(s + H) is not; and, when called, if poses have
+            another size than those that the network was trained with, or are not finite.
 
     Examples:
         >>> from halgan_rl.models import CoordinateGenerator
@@ -127,76 +131,67 @@ class HallucinationBank:
     def __init__(
         self, generator: HallucinationGenerator, grid: BankGrid, *, rng: torch.Generator, chunk: int = 4
     ) -> None:
-        self._generator, self._grid, self._rng = generator, grid, rng
+        self._grid, self._rng = grid, rng
         self._pose_size = int(generator.arguments["pose_size"])
         self._flags = 2 ** (self._pose_size - 3)
         self.cells = grid.latents * self._flags * grid.cells
         was_training = generator.training
         generator.eval()
         try:
-            self._check_composition()
-            self._tabulate(chunk)
+            _check_composition(generator)
+            self._tabulate(generator, chunk)
         finally:
             generator.train(was_training)
 
     @property
     def nbytes(self) -> int:
         """Size of the table [bytes]."""
-        return sum(part.nbytes for part in (self._starts, self._places, self._changes))
+        return sum(part.nbytes for part in (self._starts, self._lines, self._kept, self._added))
 
     @torch.no_grad()
     def __call__(self, pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
         """Paint the goals, see :class:`~halgan_rl.hallucinators.Hallucinator`."""
         check_poses(self._pose_size, pose=pose, goal_pose=goal_pose)
         cells = self._cells_at(pose, goal_pose).flatten()
-        counts = self._starts[cells + 1] - self._starts[cells]
+        starts = self._starts.index_select(0, cells)
+        counts = self._starts.index_select(0, cells + 1) - starts
         images = torch.repeat_interleave(counts)
-        first = counts.cumsum(0) - counts
-        entries = torch.arange(len(images)) + (self._starts[cells] - first)[images]
-        places = images * (pixels.shape[-3] * pixels.shape[-2]) + self._places.index_select(0, entries)
-        change = self._changes.index_select(0, entries).to(torch.float32).div_(127)
-        flat = pixels.reshape(-1, 3)
-        before = to_float(flat.index_select(0, places)[:, None, None])  # each pixel an image of its own
-        after = to_uint8(self._generator.compose(before, change[:, :, None, None]))
-        return flat.index_copy(0, places, after[:, 0, 0]).view(pixels.shape)
+        entries = torch.arange(len(images)) + (starts - counts.cumsum(0) + counts).index_select(0, images)
+        height, width = pixels.shape[-3:-1]
+        places = images * height + self._lines.index_select(0, entries)
+        lines = pixels.reshape(-1, width, 3)
+        before, kept, added = (
+            part.index_select(0, where).to(torch.int16)
+            for part, where in ((lines, places), (self._kept, entries), (self._added, entries))
+        )
+        after = before.mul_(kept).add_(WHOLE // 2).bitwise_right_shift_(SHIFT).add_(added).clamp_(max=255)
+        return replace_rows(lines, places, after.to(torch.uint8)).view(pixels.shape)
 
     def _cells_at(self, pose: Tensor, goal_pose: Tensor) -> Tensor:
         """Return the rows of the table ``[N, F]`` for poses ``[N, F, P]`` and goals ``[N, 1, P]``; one latent a row."""
         cell, in_sight = self._grid.cells_at(relative_pose(pose, goal_pose))
-        powers = 2 ** torch.arange(self._pose_size - 3)
-        flags = ((pose[..., 3:] > 0.5) * powers).sum(-1)
         latent = torch.randint(self._grid.latents, (len(pose), 1), generator=self._rng)
-        return torch.where(in_sight, (latent * self._flags + flags) * self._grid.cells + cell, self.cells)
+        if self._flags > 1:
+            powers = 2 ** torch.arange(self._pose_size - 3)
+            latent = latent * self._flags + ((pose[..., 3:] > 0.5) * powers).sum(-1)
+        return torch.where(in_sight, latent * self._grid.cells + cell, self.cells)
 
     @torch.no_grad()
-    def _tabulate(self, chunk: int) -> None:
+    def _tabulate(self, generator: HallucinationGenerator, chunk: int) -> None:
         """Ask the generator for every cell, and keep what is to be seen of its answers."""
-        generator, rng = self._generator, self._rng
         features = generator.encoding(generator.encoding.labels(*self._poses()))
-        counts, places, changes = [], [], []
-        for latent in generator.sample_latent(self._grid.latents, rng):
+        counts, lines, kept, added = [], [], [], []
+        for latent in generator.sample_latent(self._grid.latents, self._rng):
             for block in features.split(BLOCK):
-                change = self._ask(block, latent, chunk)
-                visible = torch.cat([self._visible(part) for part in change.split(chunk)])
+                keep, add = _ask(generator, block, latent, chunk)
+                visible = torch.maximum(255 - keep.to(torch.int16) * 255 // WHOLE, add).amax((2, 3)) > VISIBLE
                 counts.append(visible.sum(1))
-                places.append(visible.nonzero()[:, 1].to(torch.int16))
-                changes.append(change[visible])
-        self._starts = torch.cat(
-            [torch.zeros(1, dtype=torch.int64), *counts, torch.zeros(1, dtype=torch.int64)]
-        ).cumsum(0)
-        self._places, self._changes = torch.cat(places), torch.cat(changes)
-
-    def _ask(self, features: Tensor, latent: Tensor, chunk: int) -> Tensor:
-        """Return what the generator paints, int8 ``[N, H * W, C]``; in one tensor, or the heap falls to pieces."""
-        changes = torch.empty(0)
-        for first in range(0, len(features), chunk):
-            part = features[first : first + chunk]
-            change = self._generator(part, latent.expand(len(part), -1)).flatten(2).transpose(1, 2)
-            if first == 0:
-                changes = torch.empty(len(features), *change.shape[1:], dtype=torch.int8)
-            torch.round(change * 127, out=change)
-            changes[first : first + chunk] = change
-        return changes
+                lines.append(visible.nonzero()[:, 1])
+                kept.append(keep[visible])
+                added.append(add[visible])
+        none = torch.zeros(1, dtype=torch.int64)
+        self._starts = torch.cat([none, *counts, none]).cumsum(0)  # the last cell, out of sight, is empty
+        self._lines, self._kept, self._added = torch.cat(lines), torch.cat(kept), torch.cat(added)
 
     def _poses(self) -> tuple[Tensor, Tensor]:
         """Return poses at the origin, with all settings of the flags, and the goal poses to see from there."""
@@ -206,22 +201,33 @@ class HallucinationBank:
         pose = torch.cat([torch.zeros(len(flags), 3), flags], -1)
         return pose, torch.cat([relative.repeat(self._flags, 1), flags], -1)
 
-    def _visible(self, change: Tensor) -> Tensor:
-        """Return which pixels of changes int8 ``[N, H * W, C]`` black and white images would show, ``[N, H * W]``."""
-        changes = change.flatten(0, 1)[:, :, None, None] / 127
-        visible = torch.zeros(len(changes), dtype=torch.bool)
-        for level in (-1.0, 1.0):
-            image = torch.full((1, 3, 1, 1), level)
-            shown = self._generator.compose(image, changes) - image
-            visible |= shown.abs().amax((1, 2, 3)) > VISIBLE / 127.5
-        return visible.view(change.shape[:2])
 
-    def _check_composition(self) -> None:
-        image, generator = torch.full((1, 3, 1, 1), 0.5), self._generator
-        change = generator(torch.zeros(1, generator.encoding.size), torch.zeros(1, generator.latent_size))
-        if not torch.allclose(generator.compose(image, torch.zeros_like(change[..., :1, :1])), image):
-            raise ValueError(
-                f"{type(generator).__name__} changes pixels where it paints nothing, all of which a bank would have to "
-                'keep: use one that is the identity there, such as the paper\'s with composition="difference", or ask '
-                "the generator each time (GanHallucinator; --no-bank in the recipes)"
-            )
+def _ask(generator: HallucinationGenerator, features: Tensor, latent: Tensor, chunk: int) -> tuple[Tensor, Tensor]:
+    """Return the shares of 128 that pixels keep, and the levels that are added to them, uint8 ``[N, H, W, 3]``."""
+    keep, add = torch.empty(2, len(features), 64, 64, 3, dtype=torch.uint8)  # whole, or the heap falls to pieces
+    for first in range(0, len(features), chunk):
+        part = features[first : first + chunk]
+        change = generator(part, latent.expand(len(part), -1))
+        black, white = (generator.compose(image, change).permute(0, 2, 3, 1) for image in _grey(-1.0, 1.0))
+        keep[first : first + chunk] = ((white - black) * (WHOLE / 2)).round_()
+        add[first : first + chunk] = ((black + 1) * (255 / 2)).round_()
+    return keep, add
+
+
+def _check_composition(generator: HallucinationGenerator) -> None:
+    """Refuse what is no matte: one that maps a grey to something else than the mean of black and white."""
+    images = torch.cat(_grey(-1.0, 0.0, 1.0))
+    with torch.no_grad():
+        change = generator(torch.ones(1, generator.encoding.size), torch.ones(1, generator.latent_size))
+        black, grey, white = generator.compose(images.expand(-1, -1, *change.shape[2:]), change)
+    if not torch.allclose(grey, (black + white) / 2, atol=1e-4):
+        raise ValueError(
+            f"{type(generator).__name__} does not lay a matte over images (a share of each pixel, and a colour), which "
+            "is all that a bank can tabulate: use a CoordinateGenerator, or ask the generator each time "
+            "(GanHallucinator; --no-bank in the recipes)"
+        )
+
+
+def _grey(*levels: float) -> list[Tensor]:
+    """Return one image of one pixel ``[1, 3, 1, 1]`` for each level in [-1, 1]."""
+    return [torch.full((1, 3, 1, 1), level) for level in levels]

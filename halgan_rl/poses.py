@@ -77,5 +77,7 @@ class PoseTolerance:
         Returns:
             Bool ``[...]``: whether ``pose`` is within both tolerances of ``goal_pose``.
         """
-        ahead, left, turn = relative_pose(pose, goal_pose).unbind(-1)
-        return (torch.hypot(ahead, left) < self.distance) & (turn.abs() < self.angle)
+        check_pose_size(pose, "pose")
+        check_pose_size(goal_pose, "goal_pose")
+        x, y, yaw = (goal_pose[..., :3] - pose[..., :3]).unbind(-1)
+        return (torch.hypot(x, y) < self.distance) & (wrap_angle(yaw).abs() < self.angle)

@@ -8,6 +8,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
+from halgan_rl.rows import replace_rows
 from halgan_rl.transforms.base import ReplayTransform, next_key
 
 if TYPE_CHECKING:
@@ -94,8 +95,8 @@ class HallucinateGoal(ReplayTransform):
         index = mask.nonzero().squeeze(-1)
         if len(index) == 0:
             return pixels, next_pixels
-        root, following = self._hallucinate(*(entry[index] for entry in (pixels, next_pixels, *poses)))
-        return pixels.index_copy(0, index, root), next_pixels.index_copy(0, index, following)
+        root, following = self._hallucinate(*(entry.index_select(0, index) for entry in (pixels, next_pixels, *poses)))
+        return replace_rows(pixels, index, root), replace_rows(next_pixels, index, following)
 
     def _edit_all(self, mask: Tensor, pixels: Tensor, next_pixels: Tensor, *poses: Tensor) -> tuple[Tensor, Tensor]:
         """Hallucinates all of N rows, then keeps the masked ones: the same shapes whatever the mask."""
