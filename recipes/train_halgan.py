@@ -46,9 +46,11 @@ Differences from the paper (Sahni et al., NeurIPS 2019, appendix), all undone by
 """
 
 import dataclasses
+import math
 import shlex
 import sys
 import time
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -96,6 +98,8 @@ class Config:
     """Seed of everything random in the run."""
     iterations: int = 0
     """Generator steps of the game, after the warm start."""
+    minutes: float = math.inf
+    """Stop training after this long, whatever is left to do; what is kept then depends on the machine's speed."""
     near_goal_frames: int = 2_000
     """Size of R, the near-goal frames."""
     steps_before_goal: int = 80
@@ -106,7 +110,9 @@ class Config:
     """Folder of the run; must not hold one yet."""
 
     generator: Literal["coordinates", "paper"] = "coordinates"
-    """By coordinates with a matte, or the paper's convolutions with tanh(s + H)."""
+    """By coordinates with a matte, or the paper's convolutions."""
+    composition: Literal["dimming", "difference"] = "difference"
+    """How the paper's generator changes an image: tanh(s + H), or s + tanh(s + H) - tanh(s), the identity at H = 0."""
     configuration: Literal["planar", "polar"] = "planar"
     """The whole relative pose, or the paper's distance and bearing."""
     standardise: bool = True
@@ -141,6 +147,8 @@ class Config:
         for name in ("iterations", "warm_start_steps", "steps_before_goal"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name}={getattr(self, name)} must not be negative")
+        if not self.minutes > 0:
+            raise ValueError(f"minutes={self.minutes} must be positive")
         if self.warm_start_steps and self.generator == "paper":
             raise ValueError(
                 f"warm_start_steps={self.warm_start_steps} needs --generator coordinates: "
@@ -156,6 +164,7 @@ PRESETS = {
         iterations=50_000,
         failed_frames=10_000,
         generator="paper",
+        composition="dimming",
         configuration="polar",
         standardise=False,
         warm_start_steps=0,
@@ -182,44 +191,24 @@ def main(config: Config) -> None:
     generator = make_generator(config)
     if config.standardise:
         generator.encoding.standardise(generator.encoding.labels(near_goal["pose"], near_goal["goal_pose"]))
-    discriminator = Discriminator(generator.encoding.size, config.discriminator_stride)
 
     # Training, warm start first.
     started = time.perf_counter()
     metrics = dict.fromkeys(COLUMNS, float("nan"))
     progress = tqdm(total=config.warm_start_steps + config.iterations, unit="step", dynamic_ncols=True)
-
-    def after_step(kept: HallucinationGenerator) -> None:
-        """Show progress, and every so often compare with the truth and save."""
+    for kept, losses in train(config, generator, near_goal, failed["pixels"], rng):
+        metrics.update(losses)
         progress.update()
-        if progress.n % config.evaluate_every == 0 or progress.n == progress.total:
+        seconds = time.perf_counter() - started
+        over = seconds > 60 * config.minutes or progress.n == progress.total
+        if over or progress.n % config.evaluate_every == 0:
             metrics.update(compare_with_truth(config, kept, truth, folder.file("hallucinations.png")))
-            metrics.update(steps=progress.n, seconds=time.perf_counter() - started)
+            metrics.update(steps=progress.n, seconds=seconds)
             folder.write_metrics(metrics)
             save_weights(folder.file("generator.safetensors"), kept, make_manifest(config, generator, metrics))
             progress.set_postfix(overlap=f"{metrics['truth/mask_overlap']:.2f}", refresh=False)
-
-    if isinstance(generator, CoordinateGenerator):
-        progress.set_description("warm start")
-        for loss in warm_start(
-            generator,
-            near_goal=near_goal,
-            failed_pixels=failed["pixels"],
-            steps=config.warm_start_steps,
-            mirror=config.game.mirror,
-            rng=rng,
-        ):
-            metrics["warm_start/loss"] = loss
-            after_step(generator)
-
-    progress.set_description("game")
-    trainer = HalganTrainer(
-        generator, discriminator, near_goal=near_goal, failed_pixels=failed["pixels"], settings=config.game, rng=rng
-    )
-    for _ in range(config.iterations):
-        losses = trainer.step()
-        metrics.update({f"game/{name}": float(value) for name, value in losses.items()})
-        after_step(trainer.average)
+        if over:
+            break
     progress.close()
 
     print(
@@ -228,6 +217,26 @@ def main(config: Config) -> None:
         f"next: python recipes/ddpg_navigate.py --environment {config.environment} "
         f"--weights {folder.file('generator.safetensors')}"
     )
+
+
+def train(
+    config: Config,
+    generator: HallucinationGenerator,
+    near_goal: dict[str, Tensor],
+    failed_pixels: Tensor,
+    rng: torch.Generator,
+) -> Iterator[tuple[HallucinationGenerator, dict[str, float]]]:
+    """Yield after each step, of the warm start and then of the game, the generator worth keeping and the losses."""
+    data = {"near_goal": near_goal, "failed_pixels": failed_pixels}
+    if isinstance(generator, CoordinateGenerator):
+        mirror = config.game.mirror
+        for loss in warm_start(generator, **data, steps=config.warm_start_steps, mirror=mirror, rng=rng):
+            yield generator, {"warm_start/loss": loss}
+    discriminator = Discriminator(generator.encoding.size, config.discriminator_stride)
+    trainer = HalganTrainer(generator, discriminator, **data, settings=config.game, rng=rng)
+    for _ in range(config.iterations):
+        losses = trainer.step()
+        yield trainer.average, {f"game/{name}": float(value) for name, value in losses.items()}
 
 
 def collect(config: Config, collector: Any, count: int, seed: int) -> dict[str, Tensor]:
@@ -251,7 +260,9 @@ def render_truth(config: Config) -> dict[str, Tensor]:
 
 def make_generator(config: Config) -> HallucinationGenerator:
     """Return the untrained generator."""
-    return {"coordinates": CoordinateGenerator, "paper": PaperGenerator}[config.generator](config.configuration)
+    if config.generator == "coordinates":
+        return CoordinateGenerator(config.configuration)
+    return PaperGenerator(config.configuration, composition=config.composition)
 
 
 def compare_with_truth(

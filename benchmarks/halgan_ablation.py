@@ -1,0 +1,147 @@
+"""What each idea behind the shipped generators is worth, and how long training takes beside the paper's loop.
+
+Usage::
+
+    python -m benchmarks.halgan_ablation --out results/ablation   # an hour on one core
+
+Trains a generator with ``recipes/train_halgan.py`` once for each variant, each for the same minutes: the shipped way
+(a warm start, no game), and the game with all ideas but one. At intervals each is compared with the simulator's truth on
+the same held-out poses. Into the folder go the runs' curves, one picture and one table: fidelity in the end, steps made
+in that time, and when the variant reached the best that the paper's own loop got to.
+"""
+
+import dataclasses
+import shutil
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+import tyro
+from matplotlib.figure import Figure
+
+from benchmarks.tables import Table, report
+from halgan_rl.run_folder import check_unused, read_metrics
+from recipes import train_halgan
+
+GAME = {"warm_start_steps": 0, "iterations": 1_000_000, "evaluate_every": 50}
+"""The game from scratch, with all ideas: what the variants below take one idea from."""
+
+PAPER = "paper's loop"
+VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
+    "shipped: warm start, no game": ("default", {}),
+    "shipped, not mirrored": ("default", {"mirror": False}),
+    "shipped, distance and bearing for a configuration": ("default", {"configuration": "polar"}),
+    "warm start, then game": ("default", {"iterations": 1_000_000}),
+    "game with all ideas": ("default", GAME),
+    "game, no moving average": ("default", GAME | {"average_decay": 0.0}),
+    "game, penalty at every step": ("default", GAME | {"penalty_interval": 1}),
+    "game, 5 critic steps": ("default", GAME | {"critic_steps": 5, "evaluate_every": 20}),
+    "game, not mirrored": ("default", GAME | {"mirror": False}),
+    "game, distance and bearing for a configuration": (
+        "default",
+        GAME | {"configuration": "polar", "standardise": False},
+    ),
+    "game, wide kernel density": ("default", GAME | {"bandwidth": 1.0}),
+    "game, paper's generator, identity where H = 0": ("default", GAME | {"generator": "paper"}),
+    "game, paper's generator, tanh(s + H)": ("default", GAME | {"generator": "paper", "composition": "dimming"}),
+    PAPER: ("paper", {"evaluate_every": 5}),
+}
+"""Name: preset of ``train_halgan``, and what is changed of it; keys are its fields or those of its ``game``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Ablation:
+    """What each idea behind the shipped generators is worth."""
+
+    out: Path = Path("runs/ablation")
+    """Folder of the table; must not hold one yet."""
+    minutes: float = 5.0
+    """Of training, each variant."""
+    paper_minutes: float = 15.0
+    """Of training, the paper's loop."""
+    only: tuple[str, ...] = tuple(VARIANTS)
+    """Variants to run."""
+    seed: int = 0
+    """Seed of every run."""
+
+
+def main(ablation: Ablation) -> None:
+    """Train all variants, and write the table."""
+    unknown = set(ablation.only) - set(VARIANTS)
+    if unknown:
+        raise ValueError(f"unknown variants {sorted(unknown)}: choose from {list(VARIANTS)}")
+    check_unused(ablation.out)
+    torch.set_num_threads(1)
+    ablation.out.mkdir(parents=True, exist_ok=True)
+    curves = {}
+    for name in ablation.only:
+        print(name)
+        curves[name] = train(name, ablation)
+        write_report(ablation, curves)
+
+
+def train(name: str, ablation: Ablation) -> dict[str, list[float]]:
+    """Train one variant; keep its curve, return it."""
+    with TemporaryDirectory() as folder:
+        config = make_config(name, ablation, Path(folder, "run"))
+        train_halgan.main(config)
+        slug = "".join(letter if letter.isalnum() else "-" for letter in name)
+        kept = ablation.out / f"{slug}.csv"
+        shutil.copy(config.out / "metrics.csv", kept)
+        shutil.copy(config.out / "hallucinations.png", kept.with_suffix(".png"))
+    return read_metrics(kept)
+
+
+def make_config(name: str, ablation: Ablation, out: Path) -> train_halgan.Config:
+    """Return the configuration of a variant."""
+    preset, changes = VARIANTS[name]
+    config = train_halgan.PRESETS[preset]
+    game_fields = {field.name for field in dataclasses.fields(config.game)}
+    game = {key: value for key, value in changes.items() if key in game_fields}
+    rest = {key: value for key, value in changes.items() if key not in game_fields}
+    minutes = ablation.paper_minutes if name == PAPER else ablation.minutes
+    game_settings = dataclasses.replace(config.game, **game)
+    return dataclasses.replace(config, **rest, game=game_settings, minutes=minutes, seed=ablation.seed, out=out)
+
+
+def write_report(ablation: Ablation, curves: dict[str, dict[str, list[float]]]) -> None:
+    """Write table and picture of the variants that have been trained."""
+    best = max(curves[PAPER]["truth/mask_overlap"]) if PAPER in curves else float("nan")
+    lines = [
+        [
+            name,
+            f"{curve['seconds'][-1] / 60:.1f}",
+            f"{curve['steps'][-1]:.0f}",
+            f"{curve['truth/mask_overlap'][-1]:.2f}",
+            f"{curve['truth/centroid_error'][-1]:.1f}",
+            f"{curve['truth/outside_change'][-1]:.1f}",
+            reached(curve, best),
+        ]
+        for name, curve in curves.items()
+    ]
+    header = ("variant", "minutes", "steps", "mask overlap", "centre off [pixels]", "change outside [of 255]")
+    paper = f"minutes to the paper's best, {best:.2f}"
+    title = f"Held-out poses, 2 m room, seed {ablation.seed}, one thread."
+    report("ablation", [Table(title, (*header, paper), lines)], ablation.out)
+    figure = Figure(figsize=(10, 6))
+    axes = figure.subplots()
+    for name, curve in curves.items():
+        axes.plot([seconds / 60 for seconds in curve["seconds"]], curve["truth/mask_overlap"], label=name)
+    axes.set(xlabel="minutes of training", ylabel="overlap with the goal's true mask", ylim=(0, 1))
+    axes.legend(fontsize="small")
+    figure.savefig(ablation.out / "ablation.png", dpi=100, bbox_inches="tight")
+
+
+def reached(curve: dict[str, list[float]], overlap: float) -> str:
+    """Return the minutes after which a curve first reaches an overlap."""
+    minutes = [
+        seconds / 60
+        for seconds, value in zip(curve["seconds"], curve["truth/mask_overlap"], strict=True)
+        if value >= overlap
+    ]
+    return f"{minutes[0]:.2f}" if minutes else "never"
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Ablation, description=__doc__))
