@@ -104,12 +104,13 @@ class HallucinationBank:
     Of these only the image lines are stored in which something is to be seen, 8 bits a value. A hallucination is then
     a lookup and a little integer arithmetic.
 
-    The same interface as :class:`~halgan_rl.hallucinators.GanHallucinator`, and the same goal in all images of a row.
+    The same interface as :class:`~halgan_rl.hallucinators.GanHallucinator`.
 
     Args:
         generator: the trained network; its train or eval mode is left as it was found.
         grid: where to ask it.
         rng: draws the latents to keep, and later which of them a row is shown.
+        share_latent: the images of a row share one latent, so that they show one and the same goal.
         chunk: images of one pass of the generator.
 
     Attributes:
@@ -129,9 +130,15 @@ class HallucinationBank:
     """
 
     def __init__(
-        self, generator: HallucinationGenerator, grid: BankGrid, *, rng: torch.Generator, chunk: int = 4
+        self,
+        generator: HallucinationGenerator,
+        grid: BankGrid,
+        *,
+        rng: torch.Generator,
+        share_latent: bool = True,
+        chunk: int = 4,
     ) -> None:
-        self._grid, self._rng = grid, rng
+        self._grid, self._rng, self._share_latent = grid, rng, share_latent
         self._pose_size = int(generator.arguments["pose_size"])
         self._flags = 2 ** (self._pose_size - 3)
         self.cells = grid.latents * self._flags * grid.cells
@@ -168,9 +175,10 @@ class HallucinationBank:
         return replace_rows(lines, places, after.to(torch.uint8)).view(pixels.shape)
 
     def _cells_at(self, pose: Tensor, goal_pose: Tensor) -> Tensor:
-        """Return the rows of the table ``[N, F]`` for poses ``[N, F, P]`` and goals ``[N, 1, P]``; one latent a row."""
+        """Return the rows of the table ``[N, F]`` for poses ``[N, F, P]`` and goals ``[N, 1, P]``."""
         cell, in_sight = self._grid.cells_at(relative_pose(pose, goal_pose))
-        latent = torch.randint(self._grid.latents, (len(pose), 1), generator=self._rng)
+        latents_a_row = 1 if self._share_latent else pose.shape[1]
+        latent = torch.randint(self._grid.latents, (len(pose), latents_a_row), generator=self._rng)
         if self._flags > 1:
             powers = 2 ** torch.arange(self._pose_size - 3)
             latent = latent * self._flags + ((pose[..., 3:] > 0.5) * powers).sum(-1)

@@ -28,20 +28,22 @@ class Hallucinator(Protocol):
 class GanHallucinator:
     """Paints goals with a trained generator.
 
-    The images of one row share one latent, so that they show one and the same goal. A plain object, no module: the
-    network's weights stay out of whoever holds it.
+    A plain object, no module: the network's weights stay out of whoever holds it.
 
     Args:
         generator: the trained network; its train or eval mode is left as it was found.
         rng: draws the latents.
+        share_latent: the images of a row share one latent, so that they show one and the same goal.
         chunk: images of one pass; few keep the activations of a pass in a CPU's cache.
 
     Raises:
         ValueError: if poses have another size than those that the network was trained with, or are not finite.
     """
 
-    def __init__(self, generator: HallucinationGenerator, *, rng: torch.Generator, chunk: int = 2) -> None:
-        self._generator, self._rng, self._chunk = generator, rng, chunk
+    def __init__(
+        self, generator: HallucinationGenerator, *, rng: torch.Generator, share_latent: bool = True, chunk: int = 2
+    ) -> None:
+        self._generator, self._rng, self._share_latent, self._chunk = generator, rng, share_latent, chunk
 
     @torch.no_grad()
     def __call__(self, pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
@@ -49,7 +51,8 @@ class GanHallucinator:
         check_poses(int(self._generator.arguments["pose_size"]), pose=pose, goal_pose=goal_pose)
         rows, frames = pixels.shape[:2]
         features = self._generator.encoding(self._generator.encoding.labels(pose, goal_pose)).flatten(0, 1)
-        latent = self._generator.sample_latent(rows, self._rng).repeat_interleave(frames, 0)
+        repeats = frames if self._share_latent else 1
+        latent = self._generator.sample_latent(rows * frames // repeats, self._rng).repeat_interleave(repeats, 0)
         was_training = self._generator.training
         self._generator.eval()
         parts = zip(*(part.split(self._chunk) for part in (pixels.flatten(0, 1), features, latent)), strict=True)

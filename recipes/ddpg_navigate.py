@@ -38,6 +38,7 @@ Differences from the paper (Sahni et al., NeurIPS 2019, appendix), all undone by
 9. Relabelling decays over 60,000 frames instead of 100,000 (which the paper does not state; its epsilon's span).
 10. The shipped generator is this library's (see ``recipes/train_halgan.py``); ``--weights`` takes any other. Its
     output is tabulated once and then looked up (`halgan_rl.hallucination_bank`); ``--no-bank`` asks the generator.
+    Both images of a row show one latent's goal (the paper does not tell; its preset draws one for each image).
 
 In both rooms the rover has no reverse gear, action -1 is rest and +1 full speed: a random walk that reverses takes half
 of its hindsight goals from behind the robot, where no camera sees them (``envs.make(..., reverse_speed=0.5)`` gives it
@@ -108,6 +109,8 @@ class Config:
     """Generator to hallucinate with; by default the one shipped for the environment."""
     bank: bool = True
     """Look hallucinations up in a table of the generator's output, made at the start, instead of asking it."""
+    share_latent: bool = True
+    """Show one and the same goal in both images of a row, instead of drawing a latent for each."""
     allow_other_mujoco: bool = False
     """Accept weights trained with another release of MuJoCo, whose images may differ."""
     seed: int = 0
@@ -206,6 +209,7 @@ PRESETS = {
         clip_targets=False,
         preactivation_weight=0.0,
         bank=False,
+        share_latent=False,
         nearness=1.0,
         max_distance=32,
         discount=0.99,
@@ -229,8 +233,9 @@ def make_hallucinator(config: Config) -> Hallucinator | None:
     )
     rng = torch.Generator().manual_seed(config.seed)
     if config.bank:
-        return HallucinationBank(generator, BankGrid(goal_offset=envs.GOAL_OFFSET), rng=rng)
-    return GanHallucinator(generator, rng=rng)
+        grid = BankGrid(goal_offset=envs.GOAL_OFFSET)
+        return HallucinationBank(generator, grid, rng=rng, share_latent=config.share_latent)
+    return GanHallucinator(generator, rng=rng, share_latent=config.share_latent)
 
 
 def make_hindsight(config: Config, hallucinator: Hallucinator | None) -> Compose | None:

@@ -58,6 +58,8 @@ class Config:
     """Generator to judge; by default the one shipped for the environment."""
     bank: bool = False
     """Judge the lookup table made from the generator instead of the generator."""
+    share_latent: bool = True
+    """Draw one latent for all images of a row, or of a trajectory, instead of one for each image."""
     seed: int = 100
     """Seed of everything random; the shipped weights were trained on other seeds."""
     frames: int = 2_000
@@ -77,9 +79,10 @@ def main(config: Config) -> None:
     generator = load_generator(path, expected=envs.fingerprint(config.environment))
     rng = torch.Generator().manual_seed(config.seed)
     torch.manual_seed(config.seed)
-    hallucinator: Hallucinator = GanHallucinator(generator, rng=rng)
+    hallucinator: Hallucinator = GanHallucinator(generator, rng=rng, share_latent=config.share_latent)
     if config.bank:
-        hallucinator = HallucinationBank(generator, BankGrid(goal_offset=envs.GOAL_OFFSET), rng=rng)
+        grid = BankGrid(goal_offset=envs.GOAL_OFFSET)
+        hallucinator = HallucinationBank(generator, grid, rng=rng, share_latent=config.share_latent)
     renderer = envs.GoalRenderer(config.environment)
 
     probe = make_probe(config, rng)

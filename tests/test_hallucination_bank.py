@@ -90,6 +90,15 @@ def test_frames_are_seen_from_their_own_pose_and_share_one_latent(generator: Coo
     assert {image.sum().item() for image in origin[:, 0]} == {image.sum().item() for image in same[:, 0]}
 
 
+def test_frames_of_a_row_may_draw_latents_of_their_own(generator: CoordinateGenerator) -> None:
+    grid = BankGrid(**SMALL)  # type: ignore[arg-type]
+    bank = HallucinationBank(generator, grid, rng=random_source(), share_latent=False)
+    frames = random_frames(1, 1).expand(6, 2, -1, -1, -1)
+    painted = bank(frames, torch.zeros(6, 2, 3), torch.tensor([0.5, 0.0, 0.0]).expand(6, 1, 3))
+    assert not torch.equal(painted[:, 0], painted[:, 1])
+    assert len(torch.unique(painted.flatten(0, 1), dim=0)) == 2
+
+
 def test_a_goal_out_of_sight_keeps_every_bit(generator: CoordinateGenerator) -> None:
     frames = random_frames(3, 1)
     behind = torch.tensor([[[-1.0, 0.1, 0.0]], [[0.0, 1.0, 0.0]], [[1.0, -1.1, 0.0]]])

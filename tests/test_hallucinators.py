@@ -22,8 +22,10 @@ def rows() -> tuple[Tensor, Tensor, Tensor]:
     return pixels, torch.rand(ROWS, FRAMES, 3, generator=rng), torch.rand(ROWS, 1, 3, generator=rng)
 
 
-def hallucinator(generator: CoordinateGenerator | PaperGenerator, *, chunk: int = 4) -> GanHallucinator:
-    return GanHallucinator(generator, rng=torch.Generator().manual_seed(2), chunk=chunk)
+def hallucinator(
+    generator: CoordinateGenerator | PaperGenerator, *, share_latent: bool = True, chunk: int = 4
+) -> GanHallucinator:
+    return GanHallucinator(generator, rng=torch.Generator().manual_seed(2), share_latent=share_latent, chunk=chunk)
 
 
 def test_every_frame_is_painted_and_the_given_ones_stay(
@@ -47,6 +49,12 @@ def test_frames_of_a_row_share_one_latent_and_rows_do_not(generator: CoordinateG
     painted = hallucinator(generator)(pixels, torch.zeros(ROWS, FRAMES, 3), torch.ones(ROWS, 1, 3))
     assert torch.equal(painted[:, 0], painted[:, 1])
     assert not torch.equal(painted[0], painted[1])
+
+
+def test_frames_of_a_row_differ_if_they_share_no_latent(generator: CoordinateGenerator) -> None:
+    pixels = torch.zeros(ROWS, FRAMES, 64, 64, 3, dtype=torch.uint8)
+    painted = hallucinator(generator, share_latent=False)(pixels, torch.zeros(ROWS, FRAMES, 3), torch.ones(ROWS, 1, 3))
+    assert len(torch.unique(painted.flatten(0, 1), dim=0)) == ROWS * FRAMES
 
 
 def test_each_frame_shows_the_goal_as_seen_from_its_own_pose(generator: CoordinateGenerator) -> None:

@@ -70,6 +70,22 @@ def test_a_run_repeats_itself_and_every_weight_is_trained(run: Path, tmp_path: P
         assert not any(torch.equal(weights["first"][name], weights[other][name]) for name in trained), other
 
 
+def test_training_ends_when_its_minutes_are_over_and_keeps_what_it_has(tmp_path: Path) -> None:
+    main(dataclasses.replace(TINY, out=tmp_path / "run", minutes=1e-6, evaluate_every=100))
+    metrics = read_metrics(tmp_path / "run" / "metrics.csv")
+    assert metrics["steps"] == [1]
+    load_generator(tmp_path / "run" / "generator.safetensors", expected=envs.fingerprint("navigate-2m"))
+
+
+@pytest.mark.parametrize("composition", ["dimming", "difference"])
+def test_the_papers_generator_composes_as_it_is_told(tmp_path: Path, composition: str) -> None:
+    changes = {"generator": "paper", "warm_start_steps": 0, "iterations": 1, "composition": composition}
+    main(dataclasses.replace(TINY, out=tmp_path / "run", **changes))  # type: ignore[arg-type]
+    generator = load_generator(tmp_path / "run" / "generator.safetensors", expected=envs.fingerprint("navigate-2m"))
+    grey = torch.full((1, 3, 64, 64), 0.5)
+    assert torch.equal(generator.compose(grey, torch.zeros_like(grey)), grey) == (composition == "difference")
+
+
 def test_a_folder_that_holds_a_run_is_refused_first(tmp_path: Path) -> None:
     (tmp_path / "metrics.csv").write_text("precious")
     with pytest.raises(FileExistsError, match="already holds a run"):
@@ -83,7 +99,9 @@ def test_unknown_flags_and_names_are_refused(args: list[str]) -> None:
         parse_config(PRESETS, args, description=None)
 
 
-@pytest.mark.parametrize("changes", [{"near_goal_frames": 0}, {"iterations": -1}, {"generator": "paper"}])
+@pytest.mark.parametrize(
+    "changes", [{"near_goal_frames": 0}, {"iterations": -1}, {"minutes": 0}, {"generator": "paper"}]
+)
 def test_values_that_cannot_work_are_refused(changes: dict[str, int]) -> None:
     with pytest.raises(ValueError, match=next(iter(changes))):
         dataclasses.replace(Config(), **changes)  # type: ignore[arg-type]

@@ -1,0 +1,38 @@
+"""Every variant of the ablation changes what its name says, and trains."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from benchmarks import halgan_ablation
+from benchmarks.halgan_ablation import PAPER, VARIANTS, Ablation, make_config
+from recipes import train_halgan
+
+
+def test_variants_differ_from_each_other_and_leave_the_paper_alone() -> None:
+    configs = [make_config(name, Ablation(), Path("out")) for name in VARIANTS]
+    assert len({json.dumps(dataclasses.asdict(config), default=str) for config in configs}) == len(VARIANTS)
+    paper = dataclasses.asdict(make_config(PAPER, Ablation(), Path("out")))
+    changed = {
+        name for name, value in dataclasses.asdict(train_halgan.PRESETS["paper"]).items() if paper[name] != value
+    }
+    assert changed == {"minutes", "evaluate_every", "out"}
+
+
+def test_the_table_has_a_line_for_each_variant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tiny = {"near_goal_frames": 40, "failed_frames": 40, "held_out_frames": 4, "evaluate_every": 1}
+    shipped = "shipped: warm start, no game"
+    monkeypatch.setattr(halgan_ablation, "VARIANTS", {shipped: ("default", tiny), PAPER: ("paper", tiny)})
+    ablation = Ablation(out=tmp_path / "table", minutes=1e-6, paper_minutes=1e-6, only=(shipped, PAPER))
+    halgan_ablation.main(ablation)
+    table = json.loads((tmp_path / "table" / "ablation.json").read_text())["tables"][0]
+    assert [row[0] for row in table["rows"]] == [shipped, PAPER]
+    assert {path.suffix for path in (tmp_path / "table").iterdir()} == {".csv", ".json", ".png"}
+
+
+def test_unknown_variants_are_refused_first(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="unknown variants"):
+        halgan_ablation.main(Ablation(out=tmp_path / "table", only=("magic",)))
+    assert not (tmp_path / "table").exists()
