@@ -4,8 +4,8 @@ Usage::
 
     python -m benchmarks.halgan_ablation --out results/ablation   # an hour on one core
 
-Trains a generator with ``recipes/train_halgan.py`` once for each variant, each for the same minutes: the shipped way
-(a warm start, no game), and the game with all ideas but one. At intervals each is compared with the simulator's truth on
+Trains a generator with ``recipes/train_halgan.py`` for each variant, each for the same minutes: the shipped way (a
+warm start, no game), and the game with all ideas but one. At intervals each is compared with the simulator's truth on
 the same held-out poses. Into the folder go the runs' curves, one picture and one table: fidelity in the end, steps made
 in that time, and when the variant reached the best that the paper's own loop got to.
 """
