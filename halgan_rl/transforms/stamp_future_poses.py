@@ -17,7 +17,9 @@ class StampFuturePoses(ReplayTransform):
     **Core rule.** Row t gets ``(hindsight, "pose")``, the poses at t+1 ... t+D, and ``(hindsight, "horizon")``, how
     many of them may serve as a goal in hindsight: those before any positive reward, any termination and the end of the
     episode. The last pose of an episode cut by its time limit is a usable goal; that of one that ended by success is
-    not. Horizon 0 means that the row is never relabelled. Beyond the episode's end its last pose is repeated.
+    not. Where the flags of the pose change, a stage of the task is completed, as at a pick-up: that pose is a usable
+    goal, the last one. Horizon 0 means that the row is never relabelled. Beyond the episode's end its last pose is
+    repeated.
 
     A row is held back until D steps or its episode's end are known, so at most D - 1 rows an environment wait here, and
     an extension of the buffer may write fewer rows than it was given, or none. Use ``extend``, with rows in order of
@@ -158,7 +160,8 @@ class StampFuturePoses(ReplayTransform):
         next_pose = self._read(rows, next_key(self.pose_key), "pose_key")
         check_pose_size(pose, f"{type(self).__name__}: the entry {dotted(self.pose_key)}")
         check_pose_size(next_pose, f"{type(self).__name__}: the entry {dotted(next_key(self.pose_key))}")
-        return Steps(pose, next_pose, last=done | terminated, solved=terminated | (reward > 0))
+        turned = (pose[..., 3:] != next_pose[..., 3:]).any(-1)
+        return Steps(pose, next_pose, last=done | terminated, solved=terminated | (reward > 0), turned=turned)
 
     def _check_poses(self, steps: Steps, waiting: list[UnfinishedEpisode]) -> None:
         """Refuses poses of another size than the pose they follow, and poses that are not finite."""

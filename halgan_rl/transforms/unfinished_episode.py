@@ -19,6 +19,8 @@ class Steps(NamedTuple):
     """``[..., T]`` bool: the row ends its episode."""
     solved: Tensor
     """``[..., T]`` bool: the row earned a positive reward or terminated, so its next pose is no failure's."""
+    turned: Tensor
+    """``[..., T]`` bool: the pose's flags change in the row: the goal before it is reached, another one pursued."""
 
 
 def future_poses(steps: Steps, count: int, max_distance: int) -> tuple[Tensor, Tensor]:
@@ -36,8 +38,9 @@ def future_poses(steps: Steps, count: int, max_distance: int) -> tuple[Tensor, T
     time = torch.arange(total, device=steps.last.device)
     end = _first_at_or_after(torch.where(steps.last, time, total - 1))[:count]
     solved = _first_at_or_after(torch.where(steps.solved, time, total))[:count]
+    turned = _first_at_or_after(torch.where(steps.turned, time, total))[:count]
     now = time[:count]
-    horizon = torch.minimum(end + 1, solved).sub_(now).clamp_(max=max_distance)
+    horizon = torch.minimum(torch.minimum(end, turned) + 1, solved).sub_(now).clamp_(max=max_distance)
     ahead = torch.arange(max_distance, device=now.device)
     poses = steps.next_pose[torch.minimum(now[:, None] + ahead, end[:, None])]
     return poses, horizon[:, None]
