@@ -18,7 +18,8 @@ from envs.gymnasium_env import GymnasiumEnv, gymnasium_id, register_named
 from envs.names import NAMES, named
 from envs.navigate import navigate_2m, navigate_4m
 from envs.near_goal import collect_failed, collect_near_goal
-from envs.oracle import GOAL_OFFSET, GoalRenderer
+from envs.oracle import GoalRenderer
+from envs.tasks.navigate import GOAL_OFFSET
 from envs.torchrl_env import ComposerEnv
 
 __all__ = [

@@ -1,6 +1,6 @@
 """Snapshots near the goal and away from it, for training a hallucinator.
 
-The near-goal ones come from a scripted controller with *privileged* access: it reads the box's position from the
+The near-goal ones come from a scripted controller with *privileged* access: it reads the goal's position from the
 simulator, which no agent may. It stands in for a person who drives the robot to the goal a few dozen times (Sahni et
 al., NeurIPS 2019, section 4); every episode ends in a real success, and no image is picked by hand.
 """
@@ -11,20 +11,20 @@ from typing import Any
 import numpy as np
 
 from envs.environment import Environment
-from envs.tasks.navigate import box_in_robot_frame
+from envs.tasks.goal import in_robot_frame
 
 _CALM_DISTANCE = 0.35
-"""Farther from the box than this [m] the driver wanders little."""
+"""Farther from the goal than this [m] the driver wanders little."""
 _FAR_NOISE = 0.2
 """Share of random actions there."""
 _NOISE = (0.6, 1.0)
-"""Lowest and highest share of random actions near the box: the snippets that hindsight relabels are wandering ones."""
+"""Lowest and highest share of random actions near the goal: the snippets that hindsight relabels are wandering ones."""
 _HOLD = 8
 """Steps that a random action of a failed episode lasts."""
 
 
 class NoisyDriver:
-    """Steers to the box, mixed with uniformly random actions; privileged.
+    """Steers to the goal, mixed with uniformly random actions; privileged.
 
     Each episode draws how noisy it is near the goal, so that its last steps look by turns like a drive and like the
     wandering of an untrained agent.
@@ -48,19 +48,20 @@ class NoisyDriver:
         self._noise = self._random_state.uniform(*self._range)
 
     def act(self, pose: np.ndarray) -> np.ndarray:
-        """An action [2] for a robot at pose [3]."""
-        ahead, left = box_in_robot_frame(pose, self._environment.task.goal_box.position(self._environment.physics))
+        """An action [2] for a robot at pose [P]."""
+        task = self._environment.task
+        ahead, left = in_robot_frame(pose, task.goal_position(self._environment.physics))
         noise = self._noise if np.hypot(ahead, left) < _CALM_DISTANCE else _FAR_NOISE
         if self._random_state.uniform() < noise:
             return self._random_state.uniform(-1, 1, size=2)
-        return self._steer(ahead, left)
+        return self._steer(ahead, left, task.goal(pose).distance)
 
-    def _steer(self, ahead: float, left: float) -> np.ndarray:
+    def _steer(self, ahead: float, left: float, distance: float) -> np.ndarray:
         task = self._environment.task
         bearing = np.arctan2(left, ahead)
-        gap = np.hypot(ahead, left) - 0.9 * task.success_distance
+        gap = np.hypot(ahead, left) - 0.9 * distance
         speed = gap / task.control_timestep if abs(bearing) < 0.5 else 0.0
-        return task.rover.action_for(max(speed, 0.0), bearing / task.control_timestep)
+        return task.robot.action_for(max(speed, 0.0), bearing / task.control_timestep)
 
 
 def collect_near_goal(
@@ -112,7 +113,7 @@ def collect_failed(environment: Environment, count: int, random_state: np.random
     """Collects snapshots of episodes with uniformly random actions that do not succeed.
 
     Each action is held for a while: turns that are drawn anew at each step average out, and all walks end at a wall.
-    The box may be in view: nobody looks.
+    The goal may be in view: nobody looks.
 
     Args:
         environment: Where to wander; ends up mid-episode.
@@ -155,7 +156,7 @@ def _wander(environment: Environment, random_state: np.random.RandomState) -> tu
 
 
 def _snapshot(timestep: Any) -> tuple[np.ndarray, np.ndarray]:
-    return timestep.observation["rover/pixels"], timestep.observation["rover/pose"]
+    return timestep.observation["pixels"], timestep.observation["pose"]
 
 
 def _subsample(snapshots: list[Any], count: int, random_state: np.random.RandomState) -> np.ndarray:

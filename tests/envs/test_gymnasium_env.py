@@ -23,7 +23,7 @@ def env():
 
 def box_of(env):
     environment = env.unwrapped.environment
-    return environment.task.goal_box.position(environment.physics)
+    return environment.task.goals["box"].box.position(environment.physics)
 
 
 @pytest.mark.parametrize("name", sorted(envs.NAMES))
@@ -243,7 +243,7 @@ def test_close_frees_both_cameras_and_may_be_repeated():
     env = envs.GymnasiumEnv("navigate-2m", render_mode="rgb_array")
     env.reset(seed=0)
     env.render()
-    cameras = [env.environment.task.rover.camera, env.environment._overview]
+    cameras = [env.environment.task.robot.camera, env.environment._overview]
     env.close()
     env.close()
     for camera in cameras:

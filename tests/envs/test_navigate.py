@@ -59,11 +59,11 @@ def test_starts_are_far_apart_free_and_reachable(named_environment):
     task, random_state = named_environment.task, np.random.RandomState(0)
     half, nearest = task.arena.size / 2, {2.0: 0.5, 4.0: 1.0}[task.arena.size]
     for _ in range(2000):
-        pose, box = task.draw_start(random_state)
+        pose, box = task.draw_start(random_state).values()
         assert np.hypot(*(pose[:2] - box)) >= nearest
-        assert np.abs(pose[:2]).max() <= half - task.rover.radius
+        assert np.abs(pose[:2]).max() <= half - task.robot.radius
         # Room for the robot between box and wall.
-        assert np.abs(box).max() <= half - task.goal_box.radius - 2 * task.rover.radius
+        assert np.abs(box).max() <= half - task.goals["box"].box.radius - 2 * task.robot.radius
         assert -np.pi <= pose[2] <= np.pi
 
 
@@ -78,8 +78,8 @@ def test_every_named_environment_keeps_its_spec(named_environment):
     random_state = np.random.RandomState(1)
     timestep = named_environment.reset()
     assert {name: (s.shape, s.dtype) for name, s in spec.items()} == {
-        "rover/pixels": ((64, 64, 3), np.uint8),
-        "rover/pose": ((3,), np.float32),
+        "pixels": ((64, 64, 3), np.uint8),
+        "pose": ((3,), np.float32),
     }
     for _ in range(20):
         for name, value in timestep.observation.items():
@@ -92,19 +92,19 @@ def test_the_rooms_have_the_paper_s_size_and_the_small_one():
     sizes = {}
     for name, build in envs.NAMES.items():
         environment = build(random_state=0)
-        sizes[name] = (environment.task.arena.size, environment.task.centring_tolerance)
+        sizes[name] = (environment.task.arena.size, environment.task.goals["box"].tolerance)
         environment.close()
     assert sizes == {"navigate-4m": (4.0, 0.01), "navigate-2m": (2.0, 0.02)}
 
 
 def test_a_reset_never_recompiles(room_2m):
     room_2m.reset()
-    model, camera = room_2m.physics.model.ptr, room_2m.task.rover.camera
+    model, camera = room_2m.physics.model.ptr, room_2m.task.robot.camera
     start = time.perf_counter()
     for _ in range(20):
         room_2m.reset()
     assert room_2m.physics.model.ptr is model
-    assert room_2m.task.rover.camera is camera
+    assert room_2m.task.robot.camera is camera
     assert (time.perf_counter() - start) / 20 < 0.03
 
 
@@ -121,7 +121,7 @@ def run_episode(environment):
     observations = [environment.reset().observation]
     observations += [environment.step(actions.uniform(-1, 1, size=2)).observation for _ in range(10)]
     environment.close()
-    return tuple(np.stack([o[name] for o in observations]) for name in ("rover/pixels", "rover/pose"))
+    return tuple(np.stack([o[name] for o in observations]) for name in ("pixels", "pose"))
 
 
 @pytest.mark.parametrize(
