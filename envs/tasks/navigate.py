@@ -50,11 +50,6 @@ class Navigate(GoalTask):
     ) -> None:
         self._goal = Goal(goal_box, success_distance, centring_tolerance)
         self._goal.check(robot.radius, distance_name="success_distance", tolerance_name="centring_tolerance")
-        if not min_start_distance > success_distance:
-            raise ValueError(
-                f"min_start_distance={min_start_distance} m must exceed success_distance={success_distance} m, "
-                "or episodes start solved."
-            )
         super().__init__(robot, arena, {"box": self._goal}, min_start_distance=min_start_distance, **kwargs)
 
     def goal(self, pose: np.ndarray) -> Goal:

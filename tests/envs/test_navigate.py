@@ -131,7 +131,7 @@ def run_episode(environment):
         ({"size": 0.3, "min_start_distance": 0.2}, "too small"),
         ({"success_distance": 0.05}, "success_distance=0.05 m cannot be reached"),
         ({"centring_tolerance": 0.0}, "centring_tolerance must be positive; got 0.0"),
-        ({"min_start_distance": 0.1}, "min_start_distance=0.1 m must exceed success_distance=0.16"),
+        ({"min_start_distance": 0.1}, "min_start_distance=0.1 m must exceed 0.16 m"),
         ({"min_start_distance": float("nan")}, "min_start_distance=nan"),
     ],
 )
