@@ -34,9 +34,7 @@ def _vector(name: str, value: Any, entries: tuple[str, ...]) -> np.ndarray:
     except (TypeError, ValueError):
         vector = np.array(np.nan)
     if vector.shape != (len(entries),) or not np.isfinite(vector).all():
-        raise ValueError(
-            f"{name}={value!r} must be {_count(entries)}, {', '.join(entries)}; leave it out to draw it."
-        )
+        raise ValueError(f"{name}={value!r} must be {_count(entries)}, {', '.join(entries)}; leave it out to draw it.")
     return vector
 
 
