@@ -26,7 +26,7 @@ def bare_renderer(name: str, steps: int) -> Callable[[], None]:
     """The camera alone: no step of any environment can be faster."""
     environment = envs.named(name)(random_state=0)
     environment.reset()
-    return lambda: repeat(steps, lambda: environment.task.rover.camera.render(environment.physics))
+    return lambda: repeat(steps, lambda: environment.task.robot.camera.render(environment.physics))
 
 
 def composer(name: str, steps: int) -> Callable[[], None]:
@@ -45,12 +45,12 @@ def stock_camera(name: str, steps: int) -> Callable[[], None]:
     from dm_control.composer.observation import observable
 
     environment = envs.named(name)(random_state=0)
-    rover = environment.task.rover
-    stock = observable.MJCFCamera(rover.mjcf_model.find("camera", "egocentric"), height=64, width=64)
+    task = environment.task
+    stock = observable.MJCFCamera(task.robot.mjcf_model.find("camera", "egocentric"), height=64, width=64)
     stock.enabled = True
-    rover.observables.add_observable("stock", stock)
-    rover.observables.pixels.enabled = False
-    return stepping(Environment(environment.task, time_limit=20.0, random_state=0), steps)
+    task.robot.observables.add_observable("stock", stock)
+    task.task_observables["pixels"].enabled = False
+    return stepping(Environment(task, time_limit=20.0, random_state=0), steps)
 
 
 VARIANTS = {

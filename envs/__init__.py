@@ -18,7 +18,9 @@ from envs.gymnasium_env import GymnasiumEnv, gymnasium_id, register_named
 from envs.names import NAMES, named
 from envs.navigate import navigate_2m, navigate_4m
 from envs.near_goal import collect_failed, collect_near_goal
-from envs.oracle import GOAL_OFFSET, GoalRenderer
+from envs.oracle import GoalRenderer
+from envs.pick_and_place import pick_and_place_2m
+from envs.tasks.navigate import GOAL_OFFSET
 from envs.torchrl_env import ComposerEnv
 
 __all__ = [
@@ -37,6 +39,7 @@ __all__ = [
     "named",
     "navigate_2m",
     "navigate_4m",
+    "pick_and_place_2m",
 ]
 
 register_named()

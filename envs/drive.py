@@ -26,11 +26,11 @@ class ArrowKeys:
         """Forgets a key."""
         self._held.discard(event.key)
 
-    def action(self, rover: Rover) -> np.ndarray:
+    def action(self, robot: Rover) -> np.ndarray:
         """An action [2]: up and down drive at full speed, left and right turn at the full rate, no key stands still."""
         forward, turn = self._axis("up", "down"), self._axis("left", "right")
-        speed = forward * (rover.max_speed if forward > 0 else rover.reverse_speed)
-        return rover.action_for(speed, turn * rover.max_turn_rate)
+        speed = forward * (robot.max_speed if forward > 0 else robot.reverse_speed)
+        return robot.action_for(speed, turn * robot.max_turn_rate)
 
     def _axis(self, positive: str, negative: str) -> int:
         return (positive in self._held) - (negative in self._held)
@@ -49,13 +49,13 @@ class Cockpit:
     def tick(self) -> None:
         """Takes a step, or starts the next episode after an end, and shows where it led."""
         task = self._environment.task
-        transition = read(self._environment.step(self._keys.action(task.rover)))
+        transition = read(self._environment.step(self._keys.action(task.robot)))
         for axes, image in zip(self._axes, (transition.pixels, self._environment.render_overview()), strict=True):
             axes.clear()
             axes.imshow(image)
             axes.set_axis_off()
         state = "reached!" if transition.terminated else "time is over" if transition.truncated else "arrow keys drive"
-        self.figure.suptitle(f"Find the red box: {state}")
+        self.figure.suptitle(f"{task.mission}: {state}")
         self.figure.canvas.draw_idle()
 
 

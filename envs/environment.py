@@ -13,7 +13,7 @@ class Environment(composer.Environment):
     """``composer.Environment`` without its costs: no recompilation at a reset, no buffer axis in observations.
 
     Args:
-        task: The task; its ``rover`` holds the camera.
+        task: The task; its ``robot`` holds the camera.
         time_limit: Seconds an episode.
         random_state: Seed or generator of the starts.
     """
@@ -65,5 +65,5 @@ class Environment(composer.Environment):
         """Frees cameras and physics; harmless when repeated."""
         self._close_overview()
         if self._physics is not None:
-            self.task.rover.close()
+            self.task.robot.close()
             super().close()

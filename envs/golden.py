@@ -5,11 +5,12 @@ import hashlib
 import mujoco
 import numpy as np
 
+from envs.names import named
 from envs.oracle import GoalRenderer
 from envs.rendering import BACKEND
 
 _POSE = np.array([-0.3, -0.2, 0.4])
-_BOX_POSITION = np.array([0.2, 0.1])
+_GOAL_POSITION = np.array([0.2, 0.1])
 
 
 def fingerprint(name: str) -> dict[str, str]:
@@ -20,13 +21,14 @@ def fingerprint(name: str) -> dict[str, str]:
 
     Returns:
         ``environment``: the name; ``mujoco``: its version; ``gl``: the OpenGL backend; ``golden_frame``: the SHA-256 of
-        an image from a fixed pose.
+        an image from a fixed pose, its flags 0.
 
     Raises:
         ValueError: if the name is unknown.
     """
-    renderer = GoalRenderer(name)
-    frame = renderer.render(_POSE, _BOX_POSITION)
+    environment = named(name)(random_state=0)
+    renderer = GoalRenderer(environment)
+    frame = renderer.render(np.array([*_POSE, *(0.0 for _ in environment.task.flags)]), _GOAL_POSITION)
     renderer.close()
     return {
         "environment": name,

@@ -4,6 +4,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from dm_env import specs
 from gymnasium import spaces
 
 from envs.names import NAMES, named
@@ -13,9 +14,10 @@ from envs.transition import Transition, advance, read
 class GymnasiumEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
     """A named environment as a Gymnasium environment.
 
-    Observations are a dict of ``pixels`` uint8 [64, 64, 3] and ``pose`` float32 [3] (x [m], y [m], yaw [rad]), actions
-    float32 [2] in [-1, 1]: forward speed and turn rate. Success terminates and sets ``is_success`` in the info; the
-    environment's own time limit truncates. An episode equals that of the TorchRL face with the same seed.
+    Observations are a dict of ``pixels`` uint8 [64, 64, 3] and ``pose`` float32 [P] (x [m], y [m], yaw [rad], then the
+    flags of the task), actions float32 [2] in [-1, 1]: forward speed and turn rate. Success terminates and sets
+    ``is_success`` in the info; the environment's own time limit truncates. An episode equals that of the TorchRL face
+    with the same seed.
 
     An OpenGL context lives in one process and, with EGL, on one thread: spawn the workers of vectorised environments,
     ``gymnasium.make_vec(..., vectorization_mode="async", vector_kwargs={"context": "spawn"})``.
@@ -37,7 +39,7 @@ class GymnasiumEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         self.environment = named(name)(**kwargs)
         task = self.environment.task
         self.metadata = {**self.metadata, "render_fps": round(1 / task.control_timestep)}
-        self.observation_space = _observation_space(task.rover.image_size, task.arena.size)
+        self.observation_space = _observation_space(task.robot.image_size, task.pose_spec)
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
 
     def reset(
@@ -47,8 +49,8 @@ class GymnasiumEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
 
         Args:
             seed: Of this and all later starts; None goes on with the ones before.
-            options: Fixes the start: any of ``pose``, the robot's x [m], y [m], yaw [rad], and ``box``, its x [m],
-                y [m]. What is not given is drawn.
+            options: Fixes the start, see the ``fix_start`` of the task: in Navigate any of ``pose``, the robot's x [m],
+                y [m], yaw [rad], and ``box``, its x [m], y [m]. What is not given is drawn.
 
         Returns:
             The first observation, and the info.
@@ -105,10 +107,10 @@ def register_named() -> None:
         gymnasium.register(gymnasium_id(name), f"{__name__}:{GymnasiumEnv.__name__}", kwargs={"name": name})
 
 
-def _observation_space(image_size: tuple[int, int], room_size: float) -> spaces.Dict:
-    farthest = np.array([room_size / 2, room_size / 2, np.pi], np.float32)
+def _observation_space(image_size: tuple[int, int], pose: specs.BoundedArray) -> spaces.Dict:
     return spaces.Dict(
-        pixels=spaces.Box(0, 255, (*image_size, 3), np.uint8), pose=spaces.Box(-farthest, farthest, dtype=np.float32)
+        pixels=spaces.Box(0, 255, (*image_size, 3), np.uint8),
+        pose=spaces.Box(pose.minimum, pose.maximum, dtype=np.float32),
     )
 
 

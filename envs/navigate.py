@@ -20,14 +20,14 @@ def navigate_4m(
         reverse_speed: Of the robot at forward action -1 [m/s]; 0: it has no reverse gear.
     """
     # The robot, and what it must find.
-    rover = Rover(reverse_speed=reverse_speed)
+    robot = Rover(reverse_speed=reverse_speed)
     goal_box = GoalBox()
 
     # A room to search.
     arena = WalledRoom(size=4.0)
 
     # A task that rewards success only.
-    task = Navigate(rover, arena, goal_box, min_start_distance=1.0, centring_tolerance=0.01)
+    task = Navigate(robot, arena, goal_box, min_start_distance=1.0, centring_tolerance=0.01)
 
     return Environment(task, time_limit=time_limit, random_state=random_state)
 
@@ -43,13 +43,13 @@ def navigate_2m(
         reverse_speed: Of the robot at forward action -1 [m/s]; 0: it has no reverse gear.
     """
     # The robot, and what it must find.
-    rover = Rover(reverse_speed=reverse_speed)
+    robot = Rover(reverse_speed=reverse_speed)
     goal_box = GoalBox()
 
     # A room that most of a look takes in.
     arena = WalledRoom(size=2.0)
 
     # A task that rewards success only.
-    task = Navigate(rover, arena, goal_box, min_start_distance=0.5, centring_tolerance=0.02)
+    task = Navigate(robot, arena, goal_box, min_start_distance=0.5, centring_tolerance=0.02)
 
     return Environment(task, time_limit=time_limit, random_state=random_state)

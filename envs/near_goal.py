@@ -1,30 +1,31 @@
 """Snapshots near the goal and away from it, for training a hallucinator.
 
-The near-goal ones come from a scripted controller with *privileged* access: it reads the box's position from the
+The near-goal ones come from a scripted controller with *privileged* access: it reads the goal's position from the
 simulator, which no agent may. It stands in for a person who drives the robot to the goal a few dozen times (Sahni et
 al., NeurIPS 2019, section 4); every episode ends in a real success, and no image is picked by hand.
 """
 
 from collections import deque
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from envs.environment import Environment
-from envs.tasks.navigate import box_in_robot_frame
+from envs.tasks.goal import in_robot_frame
 
 _CALM_DISTANCE = 0.35
-"""Farther from the box than this [m] the driver wanders little."""
+"""Farther from the goal than this [m] the driver wanders little."""
 _FAR_NOISE = 0.2
 """Share of random actions there."""
 _NOISE = (0.6, 1.0)
-"""Lowest and highest share of random actions near the box: the snippets that hindsight relabels are wandering ones."""
+"""Lowest and highest share of random actions near the goal: the snippets that hindsight relabels are wandering ones."""
 _HOLD = 8
 """Steps that a random action of a failed episode lasts."""
 
 
 class NoisyDriver:
-    """Steers to the box, mixed with uniformly random actions; privileged.
+    """Steers to the goal, mixed with uniformly random actions; privileged.
 
     Each episode draws how noisy it is near the goal, so that its last steps look by turns like a drive and like the
     wandering of an untrained agent.
@@ -48,19 +49,20 @@ class NoisyDriver:
         self._noise = self._random_state.uniform(*self._range)
 
     def act(self, pose: np.ndarray) -> np.ndarray:
-        """An action [2] for a robot at pose [3]."""
-        ahead, left = box_in_robot_frame(pose, self._environment.task.goal_box.position(self._environment.physics))
+        """An action [2] for a robot at pose [P]."""
+        task = self._environment.task
+        ahead, left = in_robot_frame(pose, task.goal_position(self._environment.physics))
         noise = self._noise if np.hypot(ahead, left) < _CALM_DISTANCE else _FAR_NOISE
         if self._random_state.uniform() < noise:
             return self._random_state.uniform(-1, 1, size=2)
-        return self._steer(ahead, left)
+        return self._steer(ahead, left, task.goal(pose).distance)
 
-    def _steer(self, ahead: float, left: float) -> np.ndarray:
+    def _steer(self, ahead: float, left: float, distance: float) -> np.ndarray:
         task = self._environment.task
         bearing = np.arctan2(left, ahead)
-        gap = np.hypot(ahead, left) - 0.9 * task.success_distance
+        gap = np.hypot(ahead, left) - 0.9 * distance
         speed = gap / task.control_timestep if abs(bearing) < 0.5 else 0.0
-        return task.rover.action_for(max(speed, 0.0), bearing / task.control_timestep)
+        return task.robot.action_for(max(speed, 0.0), bearing / task.control_timestep)
 
 
 def collect_near_goal(
@@ -71,18 +73,22 @@ def collect_near_goal(
     steps_before_goal: int = 32,
     noise: tuple[float, float] = _NOISE,
 ) -> dict[str, np.ndarray]:
-    """Collects the last states of successful rollouts of the privileged driver.
+    """Collects the last states before each goal of successful rollouts of the privileged driver.
+
+    The flags of a pose tell which goal its image shows near. Where flags change within a rollout, as at a pick-up, one
+    goal is reached and the next begins: each goal gives about as many snapshots.
 
     Args:
         environment: Where to drive; ends up mid-episode.
         count: Number of snapshots N.
         random_state: Source of the driver's noise; the starts are the environment's own.
-        steps_before_goal: States kept of each rollout besides its final one.
+        steps_before_goal: States kept of the way to each goal besides its last one.
         noise: Lowest and highest share of random actions near the goal.
 
     Returns:
-        ``pixels`` uint8 [N, H, W, 3], ``pose`` float32 [N, 3], and ``goal_pose`` float32 [N, 3]: the robot's final
-        pose of the same rollout.
+        ``pixels`` uint8 [N, H, W, 3], ``pose`` float32 [N, P], and ``goal_pose`` float32 [N, P]: where the robot stood
+        when it reached the goal, with the flags of ``pose``. The state in which a rollout succeeds is its own goal pose
+        and among the snapshots; one in which flags change is not, for its image shows the next goal.
 
     Raises:
         ValueError: if count or steps_before_goal is out of range.
@@ -95,10 +101,9 @@ def collect_near_goal(
     snapshots: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     failures = 0
     while len(snapshots) < count:
-        tail, succeeded = _drive(environment, driver, steps_before_goal + 1)
+        ways, succeeded = _drive(environment, driver, steps_before_goal + 1)
         if succeeded:
-            goal_pose = tail[-1][1]
-            snapshots += [(pixels, pose, goal_pose) for pixels, pose in tail]
+            snapshots += ways
             failures = 0
         else:
             failures += 1
@@ -112,7 +117,8 @@ def collect_failed(environment: Environment, count: int, random_state: np.random
     """Collects snapshots of episodes with uniformly random actions that do not succeed.
 
     Each action is held for a while: turns that are drawn anew at each step average out, and all walks end at a wall.
-    The box may be in view: nobody looks.
+    The goal may be in view: nobody looks. A task with several goals gives as many snapshots of walks that start with
+    the one as of walks that start with the other, in this order.
 
     Args:
         environment: Where to wander; ends up mid-episode.
@@ -120,31 +126,46 @@ def collect_failed(environment: Environment, count: int, random_state: np.random
         random_state: Source of the actions; the starts are the environment's own.
 
     Returns:
-        ``pixels`` uint8 [M, H, W, 3] and ``pose`` float32 [M, 3].
+        ``pixels`` uint8 [M, H, W, 3] and ``pose`` float32 [M, P].
 
     Raises:
         ValueError: if count is out of range.
     """
     _check_count(count)
+    stages = environment.task.stages
     snapshots: list[tuple[np.ndarray, np.ndarray]] = []
-    while len(snapshots) < count:
-        episode, succeeded = _wander(environment, random_state)
-        snapshots += [] if succeeded else episode
-    return dict(zip(("pixels", "pose"), map(np.stack, zip(*snapshots[:count], strict=True)), strict=True))
+    for number, stage in enumerate(stages, start=1):
+        enough = count * number // len(stages)
+        while len(snapshots) < enough:
+            episode, succeeded = _wander(environment, stage, random_state)
+            snapshots += [] if succeeded else episode[: enough - len(snapshots)]
+    return dict(zip(("pixels", "pose"), map(np.stack, zip(*snapshots, strict=True)), strict=True))
 
 
 def _drive(environment: Environment, driver: NoisyDriver, keep: int) -> tuple[list[Any], bool]:
+    """One rollout: the last snapshots before each goal it reached, with its goal pose, and whether it succeeded."""
     driver.start_episode()
     timestep = environment.reset()
-    tail = deque([_snapshot(timestep)], maxlen=keep)
+    way = deque([_snapshot(timestep)], maxlen=keep)
+    ways: list[Any] = []
     while not timestep.last():
-        timestep = environment.step(driver.act(tail[-1][1]))
-        tail.append(_snapshot(timestep))
-    return list(tail), timestep.discount == 0.0
+        timestep = environment.step(driver.act(way[-1][1]))
+        pixels, pose = _snapshot(timestep)
+        if (pose[3:] != way[-1][1][3:]).any():
+            ways += _with_goal(way, pose)
+            way.clear()
+        way.append((pixels, pose))
+    return ways + _with_goal(way, pose), timestep.discount == 0.0
 
 
-def _wander(environment: Environment, random_state: np.random.RandomState) -> tuple[list[Any], bool]:
-    timestep = environment.reset()
+def _with_goal(way: Iterable[Any], goal_pose: np.ndarray) -> list[Any]:
+    return [(pixels, pose, np.append(goal_pose[:3], pose[3:])) for pixels, pose in way]
+
+
+def _wander(
+    environment: Environment, stage: Mapping[str, Any], random_state: np.random.RandomState
+) -> tuple[list[Any], bool]:
+    timestep = environment.reset_to(stage)
     episode = [_snapshot(timestep)]
     while not timestep.last():
         if (len(episode) - 1) % _HOLD == 0:
@@ -155,7 +176,7 @@ def _wander(environment: Environment, random_state: np.random.RandomState) -> tu
 
 
 def _snapshot(timestep: Any) -> tuple[np.ndarray, np.ndarray]:
-    return timestep.observation["rover/pixels"], timestep.observation["rover/pose"]
+    return timestep.observation["pixels"], timestep.observation["pose"]
 
 
 def _subsample(snapshots: list[Any], count: int, random_state: np.random.RandomState) -> np.ndarray:

@@ -15,10 +15,10 @@ from envs.transition import Transition, advance, read
 class ComposerEnv(EnvBase):
     """A composer environment as a TorchRL environment.
 
-    Reads ``action`` float32 [2]; writes ``pixels`` uint8 [64, 64, 3], ``pose`` float32 [3] (x [m], y [m], yaw [rad]),
-    ``reward`` float32 [1], and ``done``, ``terminated``, ``truncated`` bool [1]. Success terminates; the time limit
-    truncates. Pickle a factory such as ``functools.partial(envs.make, "navigate-2m")``, not the environment: an
-    OpenGL context lives in one process and, with EGL, on one thread.
+    Reads ``action`` float32 [2]; writes ``pixels`` uint8 [64, 64, 3], ``pose`` float32 [P] (x [m], y [m], yaw [rad],
+    then the flags of the task), ``reward`` float32 [1], and ``done``, ``terminated``, ``truncated`` bool [1]. Success
+    terminates; the time limit truncates. Pickle a factory such as ``functools.partial(envs.make, "navigate-2m")``, not
+    the environment: an OpenGL context lives in one process and, with EGL, on one thread.
 
     Args:
         environment: The environment, owned and closed by this one.
@@ -27,14 +27,14 @@ class ComposerEnv(EnvBase):
     def __init__(self, environment: Environment) -> None:
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([]))
         self.environment = environment
-        self.rover = environment.task.rover
+        self.robot = environment.task.robot
         self._make_specs()
 
     def _make_specs(self) -> None:
-        height, width = self.rover.image_size
+        height, width = self.robot.image_size
         self.observation_spec = Composite(
             pixels=Bounded(0, 255, shape=(height, width, 3), dtype=torch.uint8),
-            pose=Unbounded(shape=(3,), dtype=torch.float32),
+            pose=Unbounded(shape=self.environment.task.pose_spec.shape, dtype=torch.float32),
         )
         self.action_spec = Bounded(-1.0, 1.0, shape=(2,), dtype=torch.float32)
         self.reward_spec = Unbounded(shape=(1,), dtype=torch.float32)

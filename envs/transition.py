@@ -16,7 +16,7 @@ class Transition(NamedTuple):
     pixels: np.ndarray
     """The robot's image, uint8 [H, W, 3]."""
     pose: np.ndarray
-    """float32 [3]: x [m], y [m], yaw [rad]."""
+    """float32 [P]: x [m], y [m], yaw [rad], then the flags of the task."""
     reward: float
     """Of the step; 0 after a reset."""
     terminated: bool
@@ -29,8 +29,8 @@ def read(timestep: Any) -> Transition:
     """Reads a ``dm_env.TimeStep``."""
     terminated = bool(timestep.last() and timestep.discount == 0.0)
     return Transition(
-        pixels=timestep.observation["rover/pixels"],
-        pose=timestep.observation["rover/pose"],
+        pixels=timestep.observation["pixels"],
+        pose=timestep.observation["pose"],
         reward=0.0 if timestep.first() else float(timestep.reward),
         terminated=terminated,
         truncated=bool(timestep.last() and not terminated),

@@ -1,4 +1,4 @@
-"""GoalBox: the red cube that the robot must find."""
+"""GoalBox: a coloured cube that the robot must find."""
 
 from typing import Any
 
@@ -6,6 +6,9 @@ import numpy as np
 from dm_control import composer, mjcf
 
 from envs.contact import CONTACT
+
+RED = (0.85, 0.08, 0.06, 1.0)
+GREEN = (0.05, 0.62, 0.10, 1.0)
 
 
 class GoalBox(composer.Entity):
@@ -20,9 +23,7 @@ class GoalBox(composer.Entity):
         ValueError: if the size is not positive.
     """
 
-    def _build(
-        self, size: float = 0.08, rgba: tuple[float, ...] = (0.85, 0.08, 0.06, 1.0), name: str = "goal_box"
-    ) -> None:
+    def _build(self, size: float = 0.08, rgba: tuple[float, ...] = RED, name: str = "goal_box") -> None:
         if size <= 0:
             raise ValueError(f"size must be positive; got {size} m.")
         self.size = size
@@ -43,14 +44,24 @@ class GoalBox(composer.Entity):
         return float(self.size / np.sqrt(2))
 
     def after_compile(self, physics: Any, random_state: np.random.RandomState) -> None:
-        """Finds the box's address in the compiled model."""
+        """Finds the box's addresses in the compiled model."""
         del random_state
-        self._mocap = int(physics.model.ptr.body(self._mjcf_root.full_identifier).mocapid[0])
+        body = physics.model.ptr.body(self._mjcf_root.full_identifier)
+        self._mocap, self._geom = int(body.mocapid[0]), int(body.geomadr[0])
 
     def position(self, physics: Any) -> np.ndarray:
         """Of its centre: x, y [m], float64 [2], in the world frame."""
         return physics.data.ptr.mocap_pos[self._mocap, :2].copy()
 
-    def set_position(self, physics: Any, position: np.ndarray) -> None:
-        """Moves the box to x, y [m]; positions derived from it are stale until a forward."""
-        physics.data.ptr.mocap_pos[self._mocap, :2] = position
+    def set_position(self, physics: Any, position: np.ndarray, *, yaw: float = 0.0, height: float = 0.0) -> None:
+        """Moves the box to x, y [m], turned by yaw [rad], its bottom at height [m].
+
+        Positions derived from it are stale until a forward.
+        """
+        physics.data.ptr.mocap_pos[self._mocap] = *position, height
+        physics.data.ptr.mocap_quat[self._mocap] = np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)
+
+    def set_solid(self, physics: Any, solid: bool) -> None:
+        """Lets things collide with the box, or pass through it."""
+        physics.model.ptr.geom_contype[self._geom] = solid
+        physics.model.ptr.geom_conaffinity[self._geom] = solid

@@ -7,7 +7,6 @@ from dm_control import composer, mjcf
 from dm_env import specs
 
 from envs.contact import CONTACT
-from envs.observables import KnownSpec
 from envs.rendering import PersistentCamera
 
 _HIDDEN = 4
@@ -110,9 +109,6 @@ class Rover(composer.Entity):
         ):
             self._mjcf_root.actuator.add("velocity", name=name, site="centre", gear=gear, kv=load / _LAG)
 
-    def _build_observables(self) -> "RoverObservables":
-        return RoverObservables(self)
-
     @property
     def mjcf_model(self) -> mjcf.RootElement:
         """The robot's MJCF."""
@@ -168,22 +164,6 @@ class Rover(composer.Entity):
         """Places the robot at rest at x [m], y [m], yaw [rad]; positions derived from it are stale until a forward."""
         physics.data.ptr.qpos[self._qpos] = pose
         physics.data.ptr.qvel[self._qvel] = 0.0
-
-
-class RoverObservables(composer.Observables):
-    """What the robot knows: the image of its camera, and its pose."""
-
-    @composer.observable
-    def pixels(self) -> KnownSpec:
-        """The egocentric image, uint8 [height, width, 3]."""
-        spec = specs.BoundedArray((*self._entity.image_size, 3), np.uint8, 0, 255, name="pixels")
-        return KnownSpec(lambda physics: self._entity.camera.render(physics), spec)
-
-    @composer.observable
-    def pose(self) -> KnownSpec:
-        """The pose, float32 [3]: x [m], y [m], yaw [rad]."""
-        spec = specs.Array((3,), np.float32, name="pose")
-        return KnownSpec(lambda physics: self._entity.pose(physics).astype(np.float32), spec)
 
 
 def wrap_angle(angle: float) -> float:

@@ -16,8 +16,8 @@ class Stage:
     def __init__(self, environment: envs.Environment) -> None:
         self.environment = environment
         self.task = environment.task
-        self.rover = environment.task.rover
-        self.box = environment.task.goal_box
+        self.robot = environment.task.robot
+        self.box = environment.task.goals["box"].box
 
     @property
     def physics(self) -> Any:
@@ -25,7 +25,7 @@ class Stage:
 
     def place(self, pose: tuple[float, float, float], box: tuple[float, float] = (-0.6, -0.6)) -> None:
         self.environment.reset()
-        self.rover.set_pose(self.physics, np.array(pose))
+        self.robot.set_pose(self.physics, np.array(pose))
         self.box.set_position(self.physics, np.array(box))
         mujoco.mj_forward(self.physics.model.ptr, self.physics.data.ptr)
 
@@ -34,7 +34,7 @@ class Stage:
         return self.environment.step(np.array([2 * forward - 1, turn]))
 
     def pose(self) -> np.ndarray:
-        return self.rover.pose(self.physics)
+        return self.robot.pose(self.physics)
 
 
 @pytest.fixture(scope="module")

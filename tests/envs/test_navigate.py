@@ -59,12 +59,14 @@ def test_starts_are_far_apart_free_and_reachable(named_environment):
     task, random_state = named_environment.task, np.random.RandomState(0)
     half, nearest = task.arena.size / 2, {2.0: 0.5, 4.0: 1.0}[task.arena.size]
     for _ in range(2000):
-        pose, box = task.draw_start(random_state)
-        assert np.hypot(*(pose[:2] - box)) >= nearest
-        assert np.abs(pose[:2]).max() <= half - task.rover.radius
-        # Room for the robot between box and wall.
-        assert np.abs(box).max() <= half - task.goal_box.radius - 2 * task.rover.radius
+        start = task.draw_start(random_state)
+        pose = start["pose"]
+        assert np.abs(pose[:2]).max() <= half - task.robot.radius
         assert -np.pi <= pose[2] <= np.pi
+        for name, goal in task.goals.items():
+            assert np.hypot(*(pose[:2] - start[name])) >= nearest
+            # Room for the robot between box and wall.
+            assert np.abs(start[name]).max() <= half - goal.box.radius - 2 * task.robot.radius
 
 
 def test_episodes_start_without_contact(named_environment):
@@ -78,8 +80,8 @@ def test_every_named_environment_keeps_its_spec(named_environment):
     random_state = np.random.RandomState(1)
     timestep = named_environment.reset()
     assert {name: (s.shape, s.dtype) for name, s in spec.items()} == {
-        "rover/pixels": ((64, 64, 3), np.uint8),
-        "rover/pose": ((3,), np.float32),
+        "pixels": ((64, 64, 3), np.uint8),
+        "pose": ((3 + len(named_environment.task.flags),), np.float32),
     }
     for _ in range(20):
         for name, value in timestep.observation.items():
@@ -92,19 +94,24 @@ def test_the_rooms_have_the_paper_s_size_and_the_small_one():
     sizes = {}
     for name, build in envs.NAMES.items():
         environment = build(random_state=0)
-        sizes[name] = (environment.task.arena.size, environment.task.centring_tolerance)
+        task = environment.task
+        sizes[name] = (task.arena.size, *(goal.tolerance for goal in task.goals.values()))
         environment.close()
-    assert sizes == {"navigate-4m": (4.0, 0.01), "navigate-2m": (2.0, 0.02)}
+    assert sizes == {
+        "navigate-4m": (4.0, 0.01),
+        "navigate-2m": (2.0, 0.02),
+        "pick-and-place-2m": (2.0, 0.02, 0.02),
+    }
 
 
 def test_a_reset_never_recompiles(room_2m):
     room_2m.reset()
-    model, camera = room_2m.physics.model.ptr, room_2m.task.rover.camera
+    model, camera = room_2m.physics.model.ptr, room_2m.task.robot.camera
     start = time.perf_counter()
     for _ in range(20):
         room_2m.reset()
     assert room_2m.physics.model.ptr is model
-    assert room_2m.task.rover.camera is camera
+    assert room_2m.task.robot.camera is camera
     assert (time.perf_counter() - start) / 20 < 0.03
 
 
@@ -121,7 +128,7 @@ def run_episode(environment):
     observations = [environment.reset().observation]
     observations += [environment.step(actions.uniform(-1, 1, size=2)).observation for _ in range(10)]
     environment.close()
-    return tuple(np.stack([o[name] for o in observations]) for name in ("rover/pixels", "rover/pose"))
+    return tuple(np.stack([o[name] for o in observations]) for name in ("pixels", "pose"))
 
 
 @pytest.mark.parametrize(
@@ -131,7 +138,7 @@ def run_episode(environment):
         ({"size": 0.3, "min_start_distance": 0.2}, "too small"),
         ({"success_distance": 0.05}, "success_distance=0.05 m cannot be reached"),
         ({"centring_tolerance": 0.0}, "centring_tolerance must be positive; got 0.0"),
-        ({"min_start_distance": 0.1}, "min_start_distance=0.1 m must exceed success_distance=0.16"),
+        ({"min_start_distance": 0.1}, "min_start_distance=0.1 m must exceed 0.16 m"),
         ({"min_start_distance": float("nan")}, "min_start_distance=nan"),
     ],
 )

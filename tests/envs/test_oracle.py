@@ -7,7 +7,7 @@ import envs
 
 @pytest.fixture(scope="module")
 def renderer():
-    renderer = envs.GoalRenderer("navigate-2m", goal_offset=0.14)
+    renderer = envs.GoalRenderer("navigate-2m")
     yield renderer
     renderer.close()
 
@@ -17,20 +17,22 @@ def test_it_renders_what_the_environment_shows(renderer, room_2m):
         room_2m.reset()
         for _ in range(3):
             observation = room_2m.step(np.array([0.7, -0.4])).observation
-        box = room_2m.task.goal_box.position(room_2m.physics)
-        frame = renderer.render(room_2m.task.rover.pose(room_2m.physics), box)
-        np.testing.assert_array_equal(frame, observation["rover/pixels"])
+        box = room_2m.task.goals["box"].box.position(room_2m.physics)
+        frame = renderer.render(room_2m.task.robot.pose(room_2m.physics), box)
+        np.testing.assert_array_equal(frame, observation["pixels"])
 
 
 def test_the_box_stands_ahead_of_the_goal_pose(renderer):
-    np.testing.assert_allclose(renderer.box_position(np.array([0.2, 0.3, 0.5 * np.pi])), [0.2, 0.44], atol=1e-9)
+    pose, goal_pose = np.array([0.5, 0.0, 0.7]), np.array([0.2, 0.3, 0.5 * np.pi])
+    np.testing.assert_allclose(renderer.goal_position(pose, goal_pose), [0.2, 0.44], atol=1e-9)
 
 
 def test_the_goal_is_seen_from_the_pose_not_from_the_goal(renderer):
     pose, goal = torch.tensor([-0.3, 0.0, 0.0]), torch.tensor([0.1, 0.1, 0.5])
     empty = torch.from_numpy(renderer.render_without_goal(pose.double().numpy()))
     (frame,) = renderer(empty.view(1, 1, 64, 64, 3), pose.view(1, 1, 3), goal.view(1, 1, 3))[0]
-    expected = renderer.render(pose.double().numpy(), renderer.box_position(goal.double().numpy()))
+    pose, goal = pose.double().numpy(), goal.double().numpy()
+    expected = renderer.render(pose, renderer.goal_position(pose, goal))
     np.testing.assert_array_equal(frame.numpy(), expected)
 
 
@@ -84,7 +86,7 @@ def test_a_pose_without_yaw_is_refused(renderer):
 
 def test_rendering_after_close_says_so():
     renderer = envs.GoalRenderer("navigate-2m")
-    camera = renderer._environment.task.rover.camera
+    camera = renderer._environment.task.robot.camera
     renderer.close()
     renderer.close()
     with pytest.raises(RuntimeError, match="closed"):
@@ -113,6 +115,6 @@ def test_no_wall_hides_the_box(renderer):
     empty = torch.zeros(1, 1, 64, 64, 3, dtype=torch.uint8)
     pose, goal = torch.tensor([[[0.5, 0.0, 0.0]]]), torch.tensor([[[0.94, 0.0, 0.0]]])
     assert renderer(empty, pose, goal).any()
-    box = renderer.box_position(goal[0, 0].double().numpy())
+    box = renderer.goal_position(pose[0, 0].numpy(), goal[0, 0].double().numpy())
     assert box[0] > 1.04  # Wholly inside the wall ...
     np.testing.assert_array_equal(renderer.render(pose[0, 0].numpy(), box), renderer.render(pose[0, 0].numpy()))

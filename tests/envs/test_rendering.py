@@ -19,7 +19,7 @@ def run_python(code, **variables):
 def test_a_process_ends_quietly(closing):
     done = run_python(
         "import envs; env = envs.make('navigate-2m', seed=0); env.rollout(3); env.render_overview();"
-        f"camera = env.rover.camera; other = envs.GoalRenderer('navigate-2m'); {closing}"
+        f"camera = env.robot.camera; other = envs.GoalRenderer('navigate-2m'); {closing}"
     )
     assert (done.returncode, done.stderr) == (0, "")
 
@@ -68,7 +68,7 @@ def test_the_probe_really_makes_a_context():
 
 def test_images_are_upright(stage):
     stage.place((-0.5, 0.0, 0.0))
-    image = stage.rover.camera.render(stage.physics).astype(int)
+    image = stage.robot.camera.render(stage.physics).astype(int)
     wall, floor = image[2].mean(axis=0), image[-2].mean(axis=0)
     assert wall[2] > wall[0]  # The bluish wall is above,
     assert abs(floor[2] - floor[0]) < 25  # the grey floor below.
@@ -76,7 +76,7 @@ def test_images_are_upright(stage):
 
 def test_left_is_left(stage):
     stage.place((0.0, 0.0, 0.0), box=(0.4, 0.1))
-    image = stage.rover.camera.render(stage.physics).astype(int)
+    image = stage.robot.camera.render(stage.physics).astype(int)
     columns = ((image[..., 0] > 100) & (image[..., 1] < 60)).any(axis=0).nonzero()[0]
     assert 0 < columns.max() < 32
 
@@ -84,7 +84,7 @@ def test_left_is_left(stage):
 def test_it_agrees_with_dm_control_s_own_renderer(stage):
     """Within the difference that a slower renderer with shadows off and anti-aliasing makes at edges."""
     stage.place((-0.3, 0.2, -0.5), box=(0.1, 0.0))
-    ours = stage.rover.camera.render(stage.physics).astype(int)
+    ours = stage.robot.camera.render(stage.physics).astype(int)
     stock = stage.physics.render(64, 64, camera_id="rover/egocentric").astype(int)
     assert np.abs(ours - stock).mean() < 3
 

@@ -63,7 +63,7 @@ def test_a_wall_stops_the_robot(stage):
     stage.place((0.6, 0.1, 0.0))
     for _ in range(20):
         stage.step(forward=1.0)
-    assert stage.pose()[0] + stage.rover.radius == pytest.approx(1.0, abs=2e-3)
+    assert stage.pose()[0] + stage.robot.radius == pytest.approx(1.0, abs=2e-3)
 
 
 @pytest.mark.parametrize("heading", np.linspace(-3.0, 3.0, 7))
@@ -71,7 +71,7 @@ def test_no_action_leaves_the_room(stage, heading):
     stage.place((0.3, 0.2, heading))
     for _ in range(60):
         stage.step(forward=1.0, turn=0.05)
-        assert np.abs(stage.pose()[:2]).max() + stage.rover.radius < 1.01
+        assert np.abs(stage.pose()[:2]).max() + stage.robot.radius < 1.01
 
 
 @pytest.mark.parametrize("heading", np.linspace(-3.0, 3.0, 9))
@@ -80,7 +80,7 @@ def test_the_box_stops_the_robot_and_stays_put(stage, heading):
     for _ in range(15):
         if stage.step(forward=1.0, turn=0.03).last():
             break
-        gap = np.hypot(*np.maximum(np.abs(stage.pose()[:2]) - stage.box.size / 2, 0)) - stage.rover.radius
+        gap = np.hypot(*np.maximum(np.abs(stage.pose()[:2]) - stage.box.size / 2, 0)) - stage.robot.radius
         assert gap > -0.01
     np.testing.assert_array_equal(stage.box.position(stage.physics), [0.0, 0.0])
 
@@ -88,11 +88,11 @@ def test_the_box_stops_the_robot_and_stays_put(stage, heading):
 def test_the_robot_does_not_see_itself(stage):
     hidden = stage.physics.model.ptr.geom_rgba
     stage.place((0.1, -0.2, 0.7))
-    seen = stage.rover.camera.render(stage.physics)
+    seen = stage.robot.camera.render(stage.physics)
     robot = [i for i in range(len(hidden)) if stage.physics.model.ptr.geom(i).name.startswith("rover/")]
     colours = hidden[robot].copy()
     hidden[robot, 3] = 0.0
-    unseen = stage.rover.camera.render(stage.physics)
+    unseen = stage.robot.camera.render(stage.physics)
     hidden[robot] = colours
     assert len(robot) > 4
     np.testing.assert_array_equal(seen, unseen)
@@ -102,7 +102,7 @@ def test_others_do_see_the_robot():
     env = envs.ComposerEnv(envs.navigate_2m(random_state=5))
     env.reset()
     before = env.render_overview()
-    env.rover.set_pose(env.environment.physics, np.array([0.0, 0.0, 1.0]))
+    env.robot.set_pose(env.environment.physics, np.array([0.0, 0.0, 1.0]))
     env.environment.physics.forward()
     after = env.render_overview()
     env.close()
@@ -112,10 +112,10 @@ def test_others_do_see_the_robot():
 @pytest.mark.parametrize(("reverse_speed", "backward"), [(0.0, 0.0), (0.2, 0.02)])
 def test_the_lowest_action_brakes_or_reverses(reverse_speed, backward):
     environment = envs.navigate_2m(random_state=0, reverse_speed=reverse_speed)
-    start = environment.reset().observation["rover/pose"]
+    start = environment.reset().observation["pose"]
     environment.step(np.array([-1.0, 0.0]))
-    before = environment.step(np.array([-1.0, 0.0])).observation["rover/pose"]
-    after = environment.step(np.array([-1.0, 0.0])).observation["rover/pose"]
+    before = environment.step(np.array([-1.0, 0.0])).observation["pose"]
+    after = environment.step(np.array([-1.0, 0.0])).observation["pose"]
     environment.close()
     heading = np.array([np.cos(start[2]), np.sin(start[2])])
     assert -heading @ (after - before)[:2] == pytest.approx(backward, abs=1e-3)

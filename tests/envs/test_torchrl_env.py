@@ -20,8 +20,8 @@ def env():
 
 def place(env, pose, box):
     env.reset()
-    env.rover.set_pose(env.environment.physics, np.array(pose))
-    env.environment.task.goal_box.set_position(env.environment.physics, np.array(box))
+    env.robot.set_pose(env.environment.physics, np.array(pose))
+    env.environment.task.goals["box"].box.set_position(env.environment.physics, np.array(box))
     env.environment.physics.forward()
 
 
