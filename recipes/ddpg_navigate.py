@@ -40,6 +40,12 @@ Differences from the paper (Sahni et al., NeurIPS 2019, appendix), all undone by
     output is tabulated once and then looked up (`halgan_rl.hallucination_bank`); ``--no-bank`` asks the generator.
     Both images of a row show one latent's goal (the paper does not tell; its preset draws one for each image).
 
+11. The actor's last layer starts near zero, as in DDPG's own paper: without it an untrained robot may drive in circles
+    that meet the box by chance (8 % of the starts with seed 0).
+12. A moving average of the actor's weights, over some 500 updates, is what is evaluated and saved. The policy that
+    explores is the last one: in the 4 m room its success swings (56,000 and 58,000 frames: 88 and 20 %; the average's:
+    94 and 86 %).
+
 In both rooms the rover has no reverse gear, action -1 is rest and +1 full speed: a random walk that reverses takes half
 of its hindsight goals from behind the robot, where no camera sees them (``envs.make(..., reverse_speed=0.5)`` gives it
 one).
@@ -55,6 +61,7 @@ from typing import Literal
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.collectors import Collector
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import Compose
@@ -148,6 +155,10 @@ class Config:
     """Price of the square of what goes into the actor's tanh."""
     downsample: Literal["stride", "max_pool"] = "stride"
     """How the convolutions halve the image."""
+    small_output: bool = True
+    """Start the actor's last layer near zero."""
+    policy_average: float = 0.998
+    """Decay of the moving average of the actor's weights, which is evaluated and saved; 0 takes the last ones."""
 
     noise: float = 0.1
     """Standard deviation of the Gaussian noise on the actions."""
@@ -214,6 +225,8 @@ PRESETS = {
         max_distance=32,
         discount=0.99,
         downsample="max_pool",
+        small_output=False,
+        policy_average=0.0,
         epsilon_end=0.5,
         epsilon_frames=100_000,
         hallucination_frames=100_000,
@@ -280,7 +293,7 @@ def make_buffer(config: Config, hindsight: Compose | None) -> TensorDictReplayBu
 
 def make_agent(config: Config, *, action_size: int) -> tuple[TensorDictSequential, TensorDictModule]:
     """Return actor and critic; both read the camera image alone."""
-    actor = Actor(action_size, downsample=config.downsample)
+    actor = Actor(action_size, downsample=config.downsample, small_output=config.small_output)
     critic = Critic(action_size, downsample=config.downsample)
     return (
         deterministic_policy(actor),
@@ -353,8 +366,8 @@ def main(config: Config) -> None:
     """Train, evaluate, and write everything into `config.out`."""
     started = time.perf_counter()
     torch.set_num_threads(config.threads)
-    torch.manual_seed(config.seed)
     hallucinator = make_hallucinator(config)
+    torch.manual_seed(config.seed)  # After the hallucinator: with one seed all methods start from the same agent.
     folder = RunFolder(config.out, columns=COLUMNS)
     folder.write_config(dataclasses.asdict(config))
     logger = make_tensorboard(config)
@@ -378,6 +391,8 @@ def main(config: Config) -> None:
     # Learning.
     loss, target_updater = make_loss(config, actor, critic)
     optimizer = make_optimizer(config, loss)
+    average = AveragedModel(actor[0].module, multi_avg_fn=get_ema_multi_avg_fn(config.policy_average))
+    policy = deterministic_policy(average.module)
     means = Means("success_rate", "hallucinated_fraction", "q_value", "loss_value", "loss_actor")
     frames, updates, next_evaluation, success = 0, 0, config.evaluate_every, float("nan")
     progress = tqdm(total=config.total_frames, unit="frame", desc=config.hindsight, dynamic_ncols=True)
@@ -393,6 +408,7 @@ def main(config: Config) -> None:
         while frames > config.warmup_frames and updates < (frames - config.warmup_frames) // config.frames_per_update:
             batch = buffer.sample()
             losses = update(batch, loss, optimizer, target_updater)
+            average.update_parameters(actor[0].module)
             updates += 1
             means.add(
                 hallucinated_fraction=batch["goal", "mask"].float().mean() if hindsight else torch.zeros(()),
@@ -403,12 +419,12 @@ def main(config: Config) -> None:
 
         if frames >= next_evaluation or frames >= config.total_frames:
             next_evaluation += config.evaluate_every
-            evaluation = evaluate(evaluation_env, actor, seeds=starts)
+            evaluation = evaluate(evaluation_env, policy, seeds=starts)
             success = evaluation.success_rate
             metrics = {"frames": frames, "seconds": time.perf_counter() - started, "train/epsilon": float(epsilon.eps)}
             metrics |= evaluation.metrics() | means.pop()
             folder.write_metrics(metrics)
-            save_policy(folder, config, actor[0].module)
+            save_policy(folder, config, average.module)
             if logger is not None:
                 for name, value in metrics.items():
                     logger.log_scalar(name, value, step=frames)
@@ -417,7 +433,7 @@ def main(config: Config) -> None:
     progress.close()
     collector.shutdown()
 
-    draw_pictures(folder, config, evaluation_env, actor)
+    draw_pictures(folder, config, evaluation_env, policy)
     if hallucinator is not None:
         draw_hallucinations(folder.file("hallucinations.png"), config, buffer, hallucinator)
     print(
@@ -447,12 +463,12 @@ def save_policy(folder: RunFolder, config: Config, actor: Actor) -> None:
     save_weights(folder.file("policy.safetensors"), actor, manifest)
 
 
-def draw_pictures(folder: RunFolder, config: Config, env: ComposerEnv, actor: TensorDictModule) -> None:
+def draw_pictures(folder: RunFolder, config: Config, env: ComposerEnv, policy: TensorDictSequential) -> None:
     """Draw the learning curve, and film the trained agent."""
     curve = {config.hindsight: [read_metrics(folder.file("metrics.csv"))]}
     pictures.draw_learning_curves(folder.file("curve.png"), curve, title=title_of(config))
     starts = range(EVALUATION_SEED, EVALUATION_SEED + config.film_starts)
-    film = record(env, actor, partial(env.render_overview, 256, 320), seeds=starts)
+    film = record(env, policy, partial(env.render_overview, 256, 320), seeds=starts)
     pictures.write_gif(folder.file("agent.gif"), film)
 
 

@@ -14,6 +14,9 @@ Downsample = Literal["stride", "max_pool"]
 
 _VISION_SIZE = 512
 _HIDDEN_SIZE = 32
+_SMALL = 3e-3
+"""Bound on what the actor's last layer starts from (Lillicrap et al., "Continuous control with deep reinforcement
+learning", 2016, section 7)."""
 
 
 class Vision(nn.Module):
@@ -59,6 +62,8 @@ class Actor(nn.Module):
     Args:
         action_size: A.
         downsample: see :class:`Vision`.
+        small_output: start the last layer's weights and biases within 3e-3 of zero, as DDPG does: an untrained policy
+            then asks for the middle of all actions, whatever it sees.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -67,11 +72,14 @@ class Actor(nn.Module):
         torch.Size([5, 2])
     """
 
-    def __init__(self, action_size: int = 2, *, downsample: Downsample = "stride") -> None:
+    def __init__(self, action_size: int = 2, *, downsample: Downsample = "stride", small_output: bool = True) -> None:
         super().__init__()
         self.action_size = action_size
         self.vision = Vision(downsample)
         self.head = _head(_VISION_SIZE, action_size)
+        if small_output:
+            for parameter in self.head[-1].parameters():
+                nn.init.uniform_(parameter, -_SMALL, _SMALL)
 
     def forward(self, pixels: Tensor) -> Tensor:
         """Return unbounded pre-activations ``[..., A]`` for images uint8 ``[..., 64, 64, 3]``."""

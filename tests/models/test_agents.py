@@ -36,6 +36,12 @@ def test_any_leading_dimensions_give_the_same_values(name: str, downsample: Down
     torch.testing.assert_close(values[0], call(network, pixels[0]))
 
 
+def test_an_untrained_actor_asks_for_the_middle_of_all_actions_unless_told_otherwise() -> None:
+    torch.manual_seed(0)
+    small, large = (Actor(small_output=small_output)(frames(8)).abs().max() for small_output in (True, False))
+    assert small < 0.01 < 0.1 < large
+
+
 def test_weights_and_activations_are_channels_last() -> None:
     vision = Actor().vision
     layouts = []

@@ -51,6 +51,19 @@ def test_every_parameter_of_the_policy_is_updated(halgan_run: Path, tmp_path: Pa
     assert differ(trained, untrained) == set(trained)
 
 
+def test_the_average_of_the_policy_is_saved_not_the_last_one(halgan_run: Path, tmp_path: Path) -> None:
+    last = run(tmp_path / "last", policy_average=0.0)
+    assert differ(load_file(halgan_run / "policy.safetensors"), last) == set(last)
+
+
+def test_all_methods_start_from_the_same_agent(tmp_path: Path) -> None:
+    untrained = [
+        run(tmp_path / hindsight, hindsight=hindsight, total_frames=48, evaluate_every=48)
+        for hindsight in ("halgan", "none")
+    ]
+    assert differ(*untrained) == set()
+
+
 def test_everything_promised_is_written(halgan_run: Path) -> None:
     written = {path.name for path in halgan_run.iterdir()}
     assert written == {

@@ -79,7 +79,7 @@ def _images(index: Tensor, channel: int) -> Tensor:
 
 def stamped_by_reference(stream: TensorDictBase, distance: int) -> TensorDictBase:
     """The reference, in plain Python: all rows ``[T]`` of one environment, with their hindsight."""
-    next_pose = stream["next", "pose"].tolist()
+    pose, next_pose = stream["pose"].tolist(), stream["next", "pose"].tolist()
     last = stream["next", "done"].flatten().tolist()
     success = (stream["next", "terminated"] | (stream["next", "reward"] > 0)).flatten().tolist()
     futures, horizons = [], []
@@ -89,6 +89,7 @@ def stamped_by_reference(stream: TensorDictBase, distance: int) -> TensorDictBas
             failing = failing and not success[at]
             poses.append(next_pose[at])
             horizon += failing
+            failing = failing and pose[at][3:] == next_pose[at][3:]
             if last[at]:
                 break
         futures.append(poses + poses[-1:] * (distance - len(poses)))

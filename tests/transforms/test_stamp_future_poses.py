@@ -11,23 +11,26 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
 from halgan_rl.transforms import DrawHindsightGoal, StampFuturePoses
 from tests.transforms.rows import assert_identical, random_source, stamped_by_reference
 
-STEP, REWARDED, TRUNCATED, TERMINATED, SOLVED = "step", "rewarded", "truncated", "terminated", "solved"
+STEP, REWARDED, PICKED = "step", "rewarded", "picked"
+TRUNCATED, TERMINATED, SOLVED = "truncated", "terminated", "solved"
 ENDS = (TRUNCATED, TERMINATED, SOLVED)
 SUCCESSES = (REWARDED, TERMINATED, SOLVED)
 
 
 @dataclass
 class Environment:
-    """Makes rows whose poses say where they come from: (environment, episode, 0.01 · time)."""
+    """Makes rows whose poses say where they come from: (environment, episode, 0.01 · time), then a flag."""
 
     number: int = 0
     episode: int = 0
     time: int = 0
     count: int = 0
+    held: bool = False
 
     def row(self, event: str) -> dict:
         """The next row; ``id`` tells it from all others."""
         pose = self.pose(self.time)
+        self.held = self.held or event == PICKED
         row = {
             "id": torch.tensor([1000 * self.number + self.count]),
             "pixels": torch.full((2, 2, 3), self.count % 256, dtype=torch.uint8),
@@ -42,11 +45,12 @@ class Environment:
             },
         }
         self.count += 1
+        self.held = self.held and event not in ENDS
         self.episode, self.time = (self.episode + 1, 0) if event in ENDS else (self.episode, self.time + 1)
         return row
 
     def pose(self, time: int) -> torch.Tensor:
-        return torch.tensor([self.number, self.episode, 0.01 * time])
+        return torch.tensor([self.number, self.episode, 0.01 * time, self.held])
 
 
 def rows(*events: str, environment: Environment | None = None) -> TensorDict:
@@ -71,7 +75,7 @@ def test_each_row_learns_the_poses_after_its_own() -> None:
     out = StampFuturePoses(3).inv(rows(*[STEP] * 5))
     assert times(out) == [[1, 2, 3], [2, 3, 4], [3, 4, 5]]
     assert horizons(out) == [3, 3, 3]
-    assert (out["hindsight", "pose"].shape, out["hindsight", "horizon"].shape) == ((3, 3, 3), (3, 1))
+    assert (out["hindsight", "pose"].shape, out["hindsight", "horizon"].shape) == ((3, 3, 4), (3, 1))
     assert (out["hindsight", "pose"].dtype, out["hindsight", "horizon"].dtype) == (torch.float32, torch.int64)
 
 
@@ -88,6 +92,12 @@ def test_the_pose_reached_by_success_is_not_a_usable_goal(success: str) -> None:
 
 def test_a_positive_reward_in_mid_episode_bounds_the_horizon() -> None:
     assert horizons(StampFuturePoses(4).inv(rows(STEP, STEP, REWARDED, STEP, TRUNCATED))) == [2, 1, 0, 2, 1]
+
+
+def test_where_flags_change_is_the_last_usable_goal_and_another_search_begins() -> None:
+    out = StampFuturePoses(4).inv(rows(STEP, STEP, PICKED, STEP, STEP, TRUNCATED))
+    assert horizons(out) == [3, 2, 1, 3, 2, 1]
+    assert out["hindsight", "pose"][0, :, 3].tolist() == [0, 0, 1, 1]
 
 
 def test_termination_ends_an_episode_even_without_the_done_flag() -> None:
@@ -125,7 +135,7 @@ def batches(draw: st.DrawFn) -> list[TensorDict]:
     """What a collector may yield: batches ``[E, T]`` of one to three environments, which split episodes anywhere."""
     environments = [Environment(number) for number in range(draw(st.integers(1, 3)))]
     lengths = draw(st.lists(st.integers(1, 7), min_size=1, max_size=8))
-    events = st.sampled_from([STEP] * 8 + [REWARDED, TRUNCATED, TERMINATED, SOLVED])
+    events = st.sampled_from([STEP] * 8 + [PICKED, REWARDED, TRUNCATED, TERMINATED, SOLVED])
     return [
         torch.stack([rows(*(draw(events) for _ in range(length)), environment=each) for each in environments])
         for length in lengths
@@ -267,7 +277,9 @@ def test_a_pose_that_is_not_finite_never_enters_the_buffer(key: object, name: st
     good = rows(STEP, STEP, TRUNCATED, environment=environment)
     bad = good.clone()
     bad[key][1, 2] = value
-    with pytest.raises(ValueError, match=rf"^The entry {name} is not finite: \[.*{value}\] in row 1 of environment 0"):
+    with pytest.raises(
+        ValueError, match=rf"^The entry {name} is not finite: \[.*{value}, 0.0\] in row 1 of environment 0"
+    ):
         buffer.extend(bad)
     assert len(buffer) == 1
     buffer.extend(good)
@@ -275,7 +287,9 @@ def test_a_pose_that_is_not_finite_never_enters_the_buffer(key: object, name: st
 
 
 def test_shuffled_rows_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"^Row 1 of environment 0 starts at \[0\.0, 0\.0, 0\.02\], not .*consecutive"):
+    with pytest.raises(
+        ValueError, match=r"^Row 1 of environment 0 starts at \[0\.0, 0\.0, 0\.02, 0\.0\], not .*consecutive"
+    ):
         StampFuturePoses(2).inv(rows(*[STEP] * 4)[[0, 2, 1, 3]])
 
 
@@ -318,7 +332,7 @@ def test_a_pose_of_another_size_than_before_is_refused() -> None:
     stamp.inv(rows(STEP, environment=environment))
     flagged = rows(STEP, environment=environment)
     flagged["pose"] = torch.cat([flagged["pose"], torch.ones(1, 1)], dim=-1)
-    with pytest.raises(ValueError, match=r"entry pose has 4 numbers, the pose before it 3"):
+    with pytest.raises(ValueError, match=r"entry pose has 5 numbers, the pose before it 4"):
         stamp.inv(flagged)
 
 
