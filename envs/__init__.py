@@ -15,16 +15,14 @@ from envs import gl_backend  # First: it settles the OpenGL backend, which mujoc
 from envs.environment import Environment
 from envs.golden import fingerprint
 from envs.gymnasium_env import GymnasiumEnv, gymnasium_id, register_named
-from envs.names import NAMES, named
+from envs.names import NAMES, goal_offsets, named
 from envs.navigate import navigate_2m, navigate_4m
 from envs.near_goal import collect_failed, collect_near_goal
 from envs.oracle import GoalRenderer
 from envs.pick_and_place import pick_and_place_2m
-from envs.tasks.navigate import GOAL_OFFSET
 from envs.torchrl_env import ComposerEnv
 
 __all__ = [
-    "GOAL_OFFSET",
     "NAMES",
     "ComposerEnv",
     "Environment",
@@ -33,6 +31,7 @@ __all__ = [
     "collect_failed",
     "collect_near_goal",
     "fingerprint",
+    "goal_offsets",
     "gl_backend",
     "gymnasium_id",
     "make",

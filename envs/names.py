@@ -14,6 +14,22 @@ NAMES: dict[str, Callable[..., Environment]] = {
 """Functions that take ``random_state`` and ``time_limit`` [s] and build an environment."""
 
 
+def goal_offsets(name: str) -> tuple[float, ...]:
+    """How far ahead of a goal pose the goal stands, on average [m]: for each setting of the pose's flags.
+
+    >>> goal_offsets("navigate-2m")
+    (0.14,)
+
+    Raises:
+        ValueError: if the name is unknown.
+    """
+    environment = named(name)()
+    try:
+        return environment.task.goal_offsets
+    finally:
+        environment.close()
+
+
 def named(name: str) -> Callable[..., Environment]:
     """The function that builds a named environment.
 

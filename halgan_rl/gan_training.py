@@ -12,6 +12,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from halgan_rl.models.halgan import Discriminator, HallucinationGenerator
 from halgan_rl.models.pixels import to_float
+from halgan_rl.training_data import Frames, matching_flags
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,8 @@ class HalganTrainer:
         generator: learns to draw the goal; its encoding is used as it is.
         discriminator: learns to judge realism and to regress the configuration's features.
         near_goal: ``pixels`` uint8 [N, 64, 64, 3], ``pose`` [N, P] and ``goal_pose`` [N, P] of near-goal frames.
-        failed_pixels: uint8 ``[M, 64, 64, 3]``, frames into which goals are painted.
+        failed: ``pixels`` uint8 [M, 64, 64, 3] and ``pose`` [M, P] of failed frames, into which goals are painted; the
+            poses' flags tell which goal.
         settings: hyper-parameters.
         rng: draws everything that is random.
     """
@@ -65,17 +67,18 @@ class HalganTrainer:
         generator: HallucinationGenerator,
         discriminator: Discriminator,
         *,
-        near_goal: dict[str, Tensor],
-        failed_pixels: Tensor,
+        near_goal: Frames,
+        failed: Frames,
         settings: GanSettings,
         rng: torch.Generator,
     ) -> None:
         self.generator, self.discriminator, self.settings, self.rng = generator, discriminator, settings, rng
         self._encoding = generator.encoding
-        self._real_pixels, self._failed_pixels = near_goal["pixels"], failed_pixels
+        self._real_pixels, self._failed_pixels = near_goal["pixels"], failed["pixels"]
+        self._real_flags, self._failed_flags = matching_flags(near_goal, failed)
         self._labels = self._encoding.labels(near_goal["pose"], near_goal["goal_pose"])
         self._noise = self._encoding.noise(*settings.label_noise)
-        self._kernel = settings.bandwidth * scott_kernel(self._labels)
+        self._kernel = settings.bandwidth * scott_kernel(self._labels, flags=near_goal["pose"].shape[-1] - 3)
         self._generator_optimizer, self._discriminator_optimizer = (
             torch.optim.Adam(network.parameters(), lr=rate, betas=settings.betas)
             for network, rate in (
@@ -156,10 +159,11 @@ class HalganTrainer:
 
     def _draw_fake(self) -> tuple[Tensor, Tensor, Tensor]:
         """Draw failed images and features from the kernel density; return both, and the images with goals."""
-        labels = self._mirror_labels(*self._draw_rows())
+        rows, flip = self._draw_rows()
+        labels = self._mirror_labels(rows, flip)
         features = self._encoding(labels + torch.randn(labels.shape, generator=self.rng) @ self._kernel.T)
-        rows = torch.randint(len(self._failed_pixels), (len(labels),), generator=self.rng)
-        images = to_float(self._failed_pixels[rows])
+        same_goal = self._real_flags[rows, None] == self._failed_flags
+        images = to_float(self._failed_pixels[same_goal.float().multinomial(1, generator=self.rng).squeeze(1)])
         latent = self.generator.sample_latent(len(labels), self.rng)
         return images, features, self.generator.compose(images, self.generator(features, latent))
 
@@ -174,18 +178,20 @@ class HalganTrainer:
         return torch.where(flip[:, None], self._encoding.mirror(labels), labels)
 
 
-def scott_kernel(labels: Tensor) -> Tensor:
+def scott_kernel(labels: Tensor, *, flags: int = 0) -> Tensor:
     """Return a factor of the covariance of a Gaussian kernel density by Scott's rule.
 
     Args:
         labels: ``[N, L]``.
+        flags: how many of them, at the end, are flags, which the kernel leaves as they are.
 
     Returns:
         ``[L, L]`` such that ``label + kernel @ standard_normal`` draws from the density, label being any of the N.
     """
-    count, size = labels.shape
-    covariance = torch.cov(labels.T).reshape(size, size) + 1e-12 * torch.eye(size)
-    return count ** (-1 / (size + 4)) * torch.linalg.cholesky(covariance)
+    count, size = len(labels), labels.shape[1] - flags
+    covariance = torch.cov(labels[:, :size].T).reshape(size, size) + 1e-12 * torch.eye(size)
+    factor = count ** (-1 / (size + 4)) * torch.linalg.cholesky(covariance)
+    return nn.functional.pad(factor, (0, flags, 0, flags))
 
 
 def _descend(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:

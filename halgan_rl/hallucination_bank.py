@@ -8,7 +8,7 @@ from torch import Tensor
 
 from halgan_rl.hallucinators import check_poses
 from halgan_rl.models.halgan import HallucinationGenerator
-from halgan_rl.poses import relative_pose
+from halgan_rl.poses import flag_number, relative_pose
 from halgan_rl.rows import replace_rows
 
 VISIBLE = 2
@@ -30,9 +30,9 @@ class BankGrid:
     which a goal on the floor grows and sinks as it comes near.
 
     Attributes:
-        goal_offset: the goal stands this far ahead of the goal pose [m]. Turning the goal pose about the goal then
-            changes little but which side of it is seen, and one yaw is enough; with 0 for want of a better one, ask
-            for many yaws.
+        goal_offset: the goal stands this far ahead of the goal pose [m]; one for all goals, or one for each setting of
+            the poses' flags. Turning the goal pose about the goal then changes little but which side of it is seen,
+            and one yaw is enough; with 0 for want of a better one, ask for many yaws.
         nearest: of the goal, from the robot [m]; what is nearer is painted as if it were that far.
         farthest: likewise.
         widest: bearing beyond which the goal is out of sight, to either side [rad]; nothing is painted there.
@@ -45,7 +45,7 @@ class BankGrid:
         ValueError: if a length, angle or count is out of range.
     """
 
-    goal_offset: float
+    goal_offset: float | tuple[float, ...]
     nearest: float = 0.1
     farthest: float = 6.0
     widest: float = pi / 4
@@ -59,7 +59,7 @@ class BankGrid:
             raise ValueError(f"need 0 < nearest < farthest, got {self.nearest} and {self.farthest} m")
         if not 0 < self.widest <= pi:
             raise ValueError(f"widest={self.widest} rad must lie in (0, pi]")
-        if self.goal_offset < 0:
+        if min(self._offsets) < 0:
             raise ValueError(f"goal_offset={self.goal_offset} m must not be negative: the goal stands ahead")
         if min(self.distances, self.bearings) < 2 or min(self.yaws, self.latents) < 1:
             raise ValueError(
@@ -72,20 +72,42 @@ class BankGrid:
         """Cells of one latent."""
         return self.distances * self.bearings * self.yaws
 
-    def relative_poses(self) -> Tensor:
-        """Return the relative goal pose at the centre of each cell, ``[cells, 3]``."""
+    @property
+    def _offsets(self) -> tuple[float, ...]:
+        return self.goal_offset if isinstance(self.goal_offset, tuple) else (self.goal_offset,)
+
+    def offsets(self, settings: int) -> Tensor:
+        """Return the goal's offset for each of some settings of the flags, ``[settings]``.
+
+        Raises:
+            ValueError: if offsets are given for another number of settings.
+        """
+        if len(self._offsets) not in (1, settings):
+            raise ValueError(
+                f"goal_offset={self.goal_offset} has {len(self._offsets)} entries, but the poses' flags have "
+                f"{settings} settings: give one for each, or one for all"
+            )
+        return torch.tensor(self._offsets).expand(settings)
+
+    def relative_poses(self, goal_offset: float | Tensor) -> Tensor:
+        """Return the relative goal pose at the centre of each cell, ``[cells, 3]``, for one offset [m]."""
         inverse = torch.linspace(1 / self.nearest, 1 / self.farthest, self.distances)
         bearing = torch.linspace(-self.widest, self.widest, self.bearings)
         yaw = torch.arange(self.yaws) * (2 * pi / self.yaws)
         inverse, bearing, yaw = (axis.flatten() for axis in torch.meshgrid(inverse, bearing, yaw, indexing="ij"))
-        x = bearing.cos() / inverse - self.goal_offset * yaw.cos()
-        y = bearing.sin() / inverse - self.goal_offset * yaw.sin()
+        x = bearing.cos() / inverse - goal_offset * yaw.cos()
+        y = bearing.sin() / inverse - goal_offset * yaw.sin()
         return torch.stack([x, y, yaw], -1)
 
-    def cells_at(self, relative: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the cells nearest to relative goal poses ``[..., 3]``, int64 ``[...]``, and which are in sight."""
+    def cells_at(self, relative: Tensor, goal_offset: float | Tensor) -> tuple[Tensor, Tensor]:
+        """Return the cells nearest to relative goal poses ``[..., 3]``, int64 ``[...]``, and which are in sight.
+
+        Args:
+            relative: ``[..., 3]``.
+            goal_offset: of each goal [m], broadcasts against ``[...]``.
+        """
         x, y, yaw = relative.unbind(-1)
-        x, y = x + self.goal_offset * yaw.cos(), y + self.goal_offset * yaw.sin()
+        x, y = x + goal_offset * yaw.cos(), y + goal_offset * yaw.sin()
         bearing, inverse = torch.atan2(y, x), 1 / torch.hypot(x, y).clamp(self.nearest, self.farthest)
         steps = (self.distances - 1) / (1 / self.nearest - 1 / self.farthest)
         row = ((1 / self.nearest - inverse) * steps).round()
@@ -140,8 +162,9 @@ class HallucinationBank:
     ) -> None:
         self._grid, self._rng, self._share_latent = grid, rng, share_latent
         self._pose_size = int(generator.arguments["pose_size"])
-        self._flags = 2 ** (self._pose_size - 3)
-        self.cells = grid.latents * self._flags * grid.cells
+        self._settings = 2 ** (self._pose_size - 3)
+        self._offsets = grid.offsets(self._settings)
+        self.cells = grid.latents * self._settings * grid.cells
         was_training = generator.training
         generator.eval()
         try:
@@ -176,13 +199,11 @@ class HallucinationBank:
 
     def _cells_at(self, pose: Tensor, goal_pose: Tensor) -> Tensor:
         """Return the rows of the table ``[N, F]`` for poses ``[N, F, P]`` and goals ``[N, 1, P]``."""
-        cell, in_sight = self._grid.cells_at(relative_pose(pose, goal_pose))
+        setting = flag_number(pose) if self._settings > 1 else 0
+        cell, in_sight = self._grid.cells_at(relative_pose(pose, goal_pose), self._offsets[setting])
         latents_a_row = 1 if self._share_latent else pose.shape[1]
         latent = torch.randint(self._grid.latents, (len(pose), latents_a_row), generator=self._rng)
-        if self._flags > 1:
-            powers = 2 ** torch.arange(self._pose_size - 3)
-            latent = latent * self._flags + ((pose[..., 3:] > 0.5) * powers).sum(-1)
-        return torch.where(in_sight, latent * self._grid.cells + cell, self.cells)
+        return torch.where(in_sight, (latent * self._settings + setting) * self._grid.cells + cell, self.cells)
 
     @torch.no_grad()
     def _tabulate(self, generator: HallucinationGenerator, chunk: int) -> None:
@@ -203,11 +224,10 @@ class HallucinationBank:
 
     def _poses(self) -> tuple[Tensor, Tensor]:
         """Return poses at the origin, with all settings of the flags, and the goal poses to see from there."""
-        relative = self._grid.relative_poses()
+        relative = torch.cat([self._grid.relative_poses(offset) for offset in self._offsets])
         bits = 2 ** torch.arange(self._pose_size - 3)
-        flags = (torch.arange(self._flags)[:, None] & bits).bool().float().repeat_interleave(len(relative), 0)
-        pose = torch.cat([torch.zeros(len(flags), 3), flags], -1)
-        return pose, torch.cat([relative.repeat(self._flags, 1), flags], -1)
+        flags = (torch.arange(self._settings)[:, None] & bits).bool().float().repeat_interleave(self._grid.cells, 0)
+        return torch.cat([torch.zeros(len(flags), 3), flags], -1), torch.cat([relative, flags], -1)
 
 
 def _ask(generator: HallucinationGenerator, features: Tensor, latent: Tensor, chunk: int) -> tuple[Tensor, Tensor]:

@@ -38,6 +38,16 @@ def wrap_angle(angle: Tensor) -> Tensor:
     return math.pi - torch.remainder(math.pi - angle, 2 * math.pi)
 
 
+def flag_number(pose: Tensor) -> Tensor:
+    """Numbers the setting of the task flags of poses ``[..., P]``, int64 ``[...]``: the first flag is the lowest bit.
+
+    Examples:
+        >>> flag_number(torch.tensor([[0.5, 0.5, 0.0, 1.0], [0.5, 0.5, 0.0, 0.0]])).tolist()
+        [1, 0]
+    """
+    return ((pose[..., 3:] > 0.5) * 2 ** torch.arange(pose.shape[-1] - 3, device=pose.device)).sum(-1)
+
+
 def check_pose_size(pose: Tensor, name: str) -> None:
     """Raises a ``ValueError`` that names ``name`` unless ``pose`` is ``[..., P]`` with P >= 3."""
     if pose.ndim < 1 or pose.shape[-1] < 3:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from halgan_rl.models.coordinates import SIZE, CoordinateGenerator
+from halgan_rl.training_data import Frames, matching_flags
 
 LEVELS = 16
 """Levels of each colour channel that are told apart."""
@@ -28,8 +29,8 @@ LATENT_RATE = 15.0
 def warm_start(
     generator: CoordinateGenerator,
     *,
-    near_goal: dict[str, Tensor],
-    failed_pixels: Tensor,
+    near_goal: Frames,
+    failed: Frames,
     steps: int,
     rng: torch.Generator,
     batch_size: int = 128,
@@ -43,7 +44,7 @@ def warm_start(
         generator: is trained in place; its encoding must be standardised.
         near_goal: ``pixels`` uint8 [N, 64, 64, 3], ``pose`` and ``goal_pose`` [N, P]; rows of equal ``goal_pose``
             are of one rollout.
-        failed_pixels: uint8 ``[M, 64, 64, 3]``.
+        failed: ``pixels`` uint8 [M, 64, 64, 3] and ``pose`` [M, P] of failed frames.
         steps: how many.
         rng: draws the batches and the first latents.
         batch_size: frames of a step.
@@ -56,7 +57,13 @@ def warm_start(
     """
     frames, encoding = near_goal["pixels"], generator.encoding
     labels = encoding.labels(near_goal["pose"], near_goal["goal_pose"])
-    is_goal = goal_colours(frames, failed_pixels)
+    flags, failed_flags = matching_flags(near_goal, failed)
+    is_goal = torch.stack(
+        [
+            goal_colours(frames[flags == setting], failed["pixels"][failed_flags == setting])
+            for setting in range(int(flags.max()) + 1)
+        ]
+    )
     rollouts = torch.unique(near_goal["goal_pose"], dim=0, return_inverse=True)[1]
     count = int(rollouts.max()) + 1
     latents = nn.Parameter(torch.randn(2 * count, generator.latent_size, generator=rng))  # the second half for mirrored
@@ -74,7 +81,8 @@ def warm_start(
         noise = torch.randn(batch_size, generator.latent_size, generator=rng)
         latent = (1 - NOISE**2) ** 0.5 * standard[rollouts[rows] + count * flip] + NOISE * noise
         matte = generator.matte_at(generator.coordinates[where], features, latent)
-        loss = _matte_loss(matte, colours, is_goal[colour_index(colours)].float())
+        mask = is_goal[flags[rows, None], colour_index(colours)]
+        loss = _matte_loss(matte, colours, mask.float())
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

@@ -246,7 +246,7 @@ def make_hallucinator(config: Config) -> Hallucinator | None:
     )
     rng = torch.Generator().manual_seed(config.seed)
     if config.bank:
-        grid = BankGrid(goal_offset=envs.GOAL_OFFSET)
+        grid = BankGrid(goal_offset=envs.goal_offsets(config.environment))
         return HallucinationBank(generator, grid, rng=rng, share_latent=config.share_latent)
     return GanHallucinator(generator, rng=rng, share_latent=config.share_latent)
 

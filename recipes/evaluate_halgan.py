@@ -81,7 +81,7 @@ def main(config: Config) -> None:
     torch.manual_seed(config.seed)
     hallucinator: Hallucinator = GanHallucinator(generator, rng=rng, share_latent=config.share_latent)
     if config.bank:
-        grid = BankGrid(goal_offset=envs.GOAL_OFFSET)
+        grid = BankGrid(goal_offset=envs.goal_offsets(config.environment))
         hallucinator = HallucinationBank(generator, grid, rng=rng, share_latent=config.share_latent)
     renderer = envs.GoalRenderer(config.environment)
 

@@ -92,8 +92,8 @@ class Config:
 
     preset: Literal["default", "paper"] = "default"
     """Where the other values come from: what learns fastest on two cores, or the paper's appendix."""
-    environment: Literal["navigate-2m", "navigate-4m"] = "navigate-2m"
-    """The room."""
+    environment: str = "navigate-2m"
+    """One of `envs.NAMES`."""
     seed: int = 0
     """Seed of everything random in the run."""
     iterations: int = 0
@@ -187,8 +187,8 @@ def main(config: Config) -> None:
     failed = collect(config, envs.collect_failed, config.failed_frames, config.seed + 1)
     truth = render_truth(config)
 
-    # Networks.
-    generator = make_generator(config)
+    # The generator.
+    generator = make_generator(config, pose_size=near_goal["pose"].shape[-1])
     if config.standardise:
         generator.encoding.standardise(generator.encoding.labels(near_goal["pose"], near_goal["goal_pose"]))
 
@@ -196,7 +196,7 @@ def main(config: Config) -> None:
     started = time.perf_counter()
     metrics = dict.fromkeys(COLUMNS, float("nan"))
     progress = tqdm(total=config.warm_start_steps + config.iterations, unit="step", dynamic_ncols=True)
-    for kept, losses in train(config, generator, near_goal, failed["pixels"], rng):
+    for kept, losses in train(config, generator, near_goal, failed, rng):
         metrics.update(losses)
         progress.update()
         seconds = time.perf_counter() - started
@@ -223,11 +223,11 @@ def train(
     config: Config,
     generator: HallucinationGenerator,
     near_goal: dict[str, Tensor],
-    failed_pixels: Tensor,
+    failed: dict[str, Tensor],
     rng: torch.Generator,
 ) -> Iterator[tuple[HallucinationGenerator, dict[str, float]]]:
     """Yield after each step, of the warm start and then of the game, the generator worth keeping and the losses."""
-    data = {"near_goal": near_goal, "failed_pixels": failed_pixels}
+    data = {"near_goal": near_goal, "failed": failed}
     if isinstance(generator, CoordinateGenerator):
         mirror = config.game.mirror
         for loss in warm_start(generator, **data, steps=config.warm_start_steps, mirror=mirror, rng=rng):
@@ -258,11 +258,11 @@ def render_truth(config: Config) -> dict[str, Tensor]:
     return data
 
 
-def make_generator(config: Config) -> HallucinationGenerator:
+def make_generator(config: Config, *, pose_size: int) -> HallucinationGenerator:
     """Return the untrained generator."""
     if config.generator == "coordinates":
-        return CoordinateGenerator(config.configuration)
-    return PaperGenerator(config.configuration, composition=config.composition)
+        return CoordinateGenerator(config.configuration, pose_size)
+    return PaperGenerator(config.configuration, pose_size, composition=config.composition)
 
 
 def compare_with_truth(

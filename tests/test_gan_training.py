@@ -21,7 +21,7 @@ def make_trainer(kind: Literal["paper", "coordinates"], settings: GanSettings, s
         generator,
         Discriminator(generator.encoding.size, first_stride=2),
         near_goal=synthetic.near_goal(16),
-        failed_pixels=synthetic.failed(16),
+        failed=synthetic.failed(16),
         settings=settings,
         rng=torch.Generator().manual_seed(seed),
     )
@@ -89,7 +89,25 @@ def test_mirrored_images_come_with_mirrored_labels() -> None:
     assert torch.equal(features[:, 2] > 0, left_is_bright)
 
 
+def test_fakes_show_the_goal_that_is_pursued_in_their_failed_frame() -> None:
+    """Failed frames with a red bar below have a flag of 1, and so have the configurations painted into them."""
+    trainer = HalganTrainer(
+        CoordinateGenerator(pose_size=4, opacity=1e-6),
+        Discriminator(5, first_stride=2),
+        near_goal=synthetic.near_goal(16, flagged=True),
+        failed=synthetic.failed(16, flagged=True),
+        settings=GanSettings(batch_size=32),
+        rng=torch.Generator().manual_seed(0),
+    )
+    images, features, _ = trainer._draw_fake()
+    red_below = images[:, 0, 60, 0] > images[:, 1, 60, 0] + 0.5
+    assert 0 < red_below.sum() < 32
+    assert torch.equal(features[:, 4], red_below.float())
+
+
 def test_the_density_of_configurations_is_scotts() -> None:
     labels = torch.randn(500, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 0.1, 3.0])
     kernel = scott_kernel(labels)
+    flagged = scott_kernel(torch.cat([labels, torch.arange(500)[:, None] % 2], 1), flags=1)
+    torch.testing.assert_close(flagged, nn.functional.pad(kernel, (0, 1, 0, 1)))
     torch.testing.assert_close(kernel @ kernel.T, torch.cov(labels.T) * 500 ** (-2 / 7), rtol=1e-3, atol=1e-5)

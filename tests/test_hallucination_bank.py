@@ -24,7 +24,7 @@ def random_source(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def make(generator: CoordinateGenerator | PaperGenerator, *, seed: int = 0, **grid: float) -> HallucinationBank:
+def make(generator: CoordinateGenerator | PaperGenerator, *, seed: int = 0, **grid: object) -> HallucinationBank:
     return HallucinationBank(generator, BankGrid(**(SMALL | grid)), rng=random_source(seed))  # type: ignore[arg-type]
 
 
@@ -36,7 +36,7 @@ def random_frames(*shape: int) -> Tensor:
 @pytest.mark.parametrize("yaws", [1, 4])
 def test_each_cell_is_nearest_to_its_own_centre(goal_offset: float, yaws: int) -> None:
     grid = BankGrid(goal_offset=goal_offset, distances=9, bearings=11, yaws=yaws, widest=0.9)
-    cells, in_sight = grid.cells_at(grid.relative_poses())
+    cells, in_sight = grid.cells_at(grid.relative_poses(goal_offset), goal_offset)
     assert cells.tolist() == list(range(grid.cells)) == list(range(9 * 11 * yaws))
     inner = torch.arange(grid.cells).reshape(9, 11, yaws)[:, 1:-1].flatten()  # the outermost bearings may round away
     assert in_sight[inner].all()
@@ -44,7 +44,7 @@ def test_each_cell_is_nearest_to_its_own_centre(goal_offset: float, yaws: int) -
 
 def test_cells_are_spaced_by_bearing_and_inverse_distance_of_the_goal_itself() -> None:
     grid = BankGrid(goal_offset=0.2, nearest=0.2, farthest=2.0, widest=0.5, distances=10, bearings=3, yaws=2)
-    x, y, yaw = grid.relative_poses().reshape(10, 3, 2, 3)[4, 2].unbind(-1)
+    x, y, yaw = grid.relative_poses(0.2).reshape(10, 3, 2, 3)[4, 2].unbind(-1)
     assert yaw.tolist() == pytest.approx([0, math.pi])
     goal = torch.stack([x + 0.2 * yaw.cos(), y + 0.2 * yaw.sin()], -1)
     distance = 1 / (5 - 4 * 0.5)
@@ -54,8 +54,8 @@ def test_cells_are_spaced_by_bearing_and_inverse_distance_of_the_goal_itself() -
 
 def test_what_is_nearer_or_farther_than_the_grid_is_painted_at_its_edge() -> None:
     grid = BankGrid(goal_offset=0.0, distances=4, bearings=5)
-    near, far = grid.cells_at(torch.tensor([[1e-4, 0.0, 0.0], [99.0, 0.0, 0.0]]))[0]
-    edges = grid.cells_at(torch.tensor([[grid.nearest, 0.0, 0.0], [grid.farthest, 0.0, 0.0]]))[0]
+    near, far = grid.cells_at(torch.tensor([[1e-4, 0.0, 0.0], [99.0, 0.0, 0.0]]), 0.0)[0]
+    edges = grid.cells_at(torch.tensor([[grid.nearest, 0.0, 0.0], [grid.farthest, 0.0, 0.0]]), 0.0)[0]
     assert [near, far] == edges.tolist()
 
 
@@ -63,7 +63,7 @@ def test_at_a_cell_the_bank_paints_what_the_generator_does(generator: Coordinate
     grid = BankGrid(**SMALL)  # type: ignore[arg-type]
     bank = HallucinationBank(generator, grid, rng=random_source())
     latents = generator.sample_latent(grid.latents, random_source())
-    goals = grid.relative_poses().reshape(5, 7, 3, 3)[:, 1:-1].flatten(0, 2)[:, None]
+    goals = grid.relative_poses(0.0).reshape(5, 7, 3, 3)[:, 1:-1].flatten(0, 2)[:, None]
     frames, poses = random_frames(len(goals), 1), torch.zeros(len(goals), 1, 3)
     seen = bank(frames, poses, goals)
     errors = []
@@ -119,6 +119,18 @@ def test_flags_of_the_pose_choose_what_is_painted() -> None:
     pose = torch.tensor([[[0.0, 0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0, 1.0]]])
     painted = bank(frames, pose, torch.tensor([[0.5, 0.0, 0.0, 1.0]]).expand(2, 1, 4))
     assert not torch.equal(painted[0], painted[1])
+
+
+def test_each_setting_of_the_flags_has_an_offset_of_its_own() -> None:
+    generator, offsets = vivid_generator(pose_size=4), (0.0, 0.3)
+    bank = make(generator, latents=1, yaws=1, goal_offset=offsets)
+    frames = random_frames(1, 1)
+    for flag, offset in enumerate(offsets):
+        pose, straight = torch.tensor([[[0.0, 0.0, 0.0, flag]]]), torch.tensor([[[0.5, 0.0, 0.0, flag]]])
+        turned = torch.tensor([[[0.5 + offset, -offset, math.pi / 2, flag]]])  # about a goal that far ahead of it
+        assert torch.equal(bank(frames, pose, straight), bank(frames, pose, turned))
+    with pytest.raises(ValueError, match=r"has 3 entries, but the poses' flags have 2 settings"):
+        make(generator, goal_offset=(0.0, 0.1, 0.2))
 
 
 def test_the_same_seed_gives_the_same_images(generator: CoordinateGenerator) -> None:

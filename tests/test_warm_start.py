@@ -1,3 +1,4 @@
+import pytest
 import torch
 from torch import Tensor
 
@@ -7,14 +8,20 @@ from halgan_rl.warm_start import colour_index, goal_colours, warm_start
 from tests import synthetic
 
 
-def train(steps: int, seed: int = 0) -> tuple[CoordinateGenerator, list[float]]:
+def train(steps: int, seed: int = 0, *, flagged: bool = False) -> tuple[CoordinateGenerator, list[float]]:
     torch.manual_seed(0)
-    data = synthetic.near_goal(256)
-    generator = CoordinateGenerator()
+    data = synthetic.near_goal(256, flagged=flagged)
+    generator = CoordinateGenerator(pose_size=data["pose"].shape[1])
     generator.encoding.standardise(generator.encoding.labels(data["pose"], data["goal_pose"]))
     rng = torch.Generator().manual_seed(seed)
     losses = warm_start(
-        generator, near_goal=data, failed_pixels=synthetic.failed(), steps=steps, rng=rng, batch_size=64, pixels=256
+        generator,
+        near_goal=data,
+        failed=synthetic.failed(flagged=flagged),
+        steps=steps,
+        rng=rng,
+        batch_size=64,
+        pixels=256,
     )
     return generator, list(losses)
 
@@ -38,6 +45,22 @@ def test_the_goal_is_painted_in_its_colour_where_the_relative_pose_has_it() -> N
     assert near > 2 * far
 
 
+def test_flags_of_the_pose_choose_the_goal_also_if_its_colour_is_seen_everywhere_with_other_flags() -> None:
+    generator = train(150, flagged=True)[0]
+    red, green = (paint(generator, [0.3, 0.08, 0.0, flag])[32, 27] for flag in (0.0, 1.0))
+    assert red[0] > 120 > 60 > red[1]
+    assert green[1] > 120 > 60 > green[0]
+
+
+def test_goals_without_failed_frames_to_paint_them_into_are_refused() -> None:
+    data, failed = synthetic.near_goal(16, flagged=True), synthetic.failed(16, flagged=True)
+    failed["pose"][:, 3] = 0
+    with pytest.raises(ValueError, match=r"flags \[1\.0\].*no failed ones"):
+        next(
+            warm_start(CoordinateGenerator(pose_size=4), near_goal=data, failed=failed, steps=1, rng=torch.Generator())
+        )
+
+
 def test_equal_seeds_give_equal_weights() -> None:
     one, same, other = (train(3, seed)[0].state_dict() for seed in (0, 0, 1))
     assert all(torch.equal(one[name], same[name]) for name in one)
@@ -45,7 +68,7 @@ def test_equal_seeds_give_equal_weights() -> None:
 
 
 def test_the_goals_colours_are_those_that_failed_frames_lack() -> None:
-    is_goal = goal_colours(synthetic.near_goal()["pixels"], synthetic.failed())
+    is_goal = goal_colours(synthetic.near_goal()["pixels"], synthetic.failed()["pixels"])
     colours = torch.tensor([[200, 20, 20], [120, 120, 120], [20, 200, 20]], dtype=torch.uint8)
     assert is_goal[colour_index(colours)].tolist() == [True, False, False]
 

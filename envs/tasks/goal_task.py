@@ -1,7 +1,7 @@
 """GoalTask: what all tasks share in which a robot in a room must find goals by sight."""
 
 from collections.abc import Mapping
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -158,6 +158,12 @@ class GoalTask(composer.Task):
     def goal(self, pose: np.ndarray) -> Goal:
         """The goal that a robot at pose [P] pursues: the flags tell."""
         raise NotImplementedError
+
+    @property
+    def goal_offsets(self) -> tuple[float, ...]:
+        """The ``offset`` of the goal [m] for each setting of the flags, counted with the first flag as lowest bit."""
+        settings = (setting[::-1] for setting in product((0, 1), repeat=len(self.flags)))
+        return tuple(round(self.goal(np.array([0.0, 0.0, 0.0, *setting])).offset, 6) for setting in settings)
 
     def goal_position(self, physics: Any) -> np.ndarray:
         """Where the goal stands that is pursued at present, x, y [m]; privileged: no agent may ask."""

@@ -1,0 +1,1 @@
+"""Visual hindsight experience replay for PyTorch: replay transforms, hallucinators, models; knows no simulator."""
