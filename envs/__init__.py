@@ -19,6 +19,7 @@ from envs.names import NAMES, named
 from envs.navigate import navigate_2m, navigate_4m
 from envs.near_goal import collect_failed, collect_near_goal
 from envs.oracle import GoalRenderer
+from envs.pebble import find_pebble
 from envs.tasks.navigate import GOAL_OFFSET
 from envs.torchrl_env import ComposerEnv
 
@@ -31,6 +32,7 @@ __all__ = [
     "GymnasiumEnv",
     "collect_failed",
     "collect_near_goal",
+    "find_pebble",
     "fingerprint",
     "gl_backend",
     "gymnasium_id",

@@ -9,6 +9,7 @@ import tyro
 from envs.environment import Environment
 from envs.names import named
 from envs.robots.rover import Rover
+from envs.robots.turtlebot import TurtleBot
 from envs.transition import read
 
 
@@ -26,11 +27,16 @@ class ArrowKeys:
         """Forgets a key."""
         self._held.discard(event.key)
 
-    def action(self, robot: Rover) -> np.ndarray:
-        """An action [2]: up and down drive at full speed, left and right turn at the full rate, no key stands still."""
+    def action(self, robot: Rover | TurtleBot) -> Any:
+        """An action: up and down drive at full speed, left and right turn at the full rate, no key stands still.
+
+        None if the robot should stand still, and has no action for that.
+        """
         forward, turn = self._axis("up", "down"), self._axis("left", "right")
         speed = forward * (robot.max_speed if forward > 0 else robot.reverse_speed)
-        return robot.action_for(speed, turn * robot.max_turn_rate)
+        action = robot.action_for(speed, turn * robot.max_turn_rate)
+        stands_still = np.allclose(robot.velocities(action), 0.0)
+        return action if speed or turn or stands_still else None
 
     def _axis(self, positive: str, negative: str) -> int:
         return (positive in self._held) - (negative in self._held)
@@ -49,7 +55,11 @@ class Cockpit:
     def tick(self) -> None:
         """Takes a step, or starts the next episode after an end, and shows where it led."""
         task = self._environment.task
-        transition = read(self._environment.step(self._keys.action(task.robot)))
+        action = self._keys.action(task.robot)
+        if action is None and self._shown:
+            return
+        self._shown = True
+        transition = read(self._environment.step(action))
         for axes, image in zip(self._axes, (transition.pixels, self._environment.render_overview()), strict=True):
             axes.clear()
             axes.imshow(image)

@@ -1,14 +1,13 @@
 """GoalBox: the red cube that the robot must find."""
 
-from typing import Any
-
 import numpy as np
-from dm_control import composer, mjcf
+from dm_control import mjcf
 
 from envs.contact import CONTACT
+from envs.props.mocap_prop import MocapProp
 
 
-class GoalBox(composer.Entity):
+class GoalBox(MocapProp):
     """A coloured cube that stands on the floor and cannot be pushed: a mocap body, moved through physics only.
 
     Args:
@@ -33,24 +32,6 @@ class GoalBox(composer.Entity):
         )  # fmt: skip
 
     @property
-    def mjcf_model(self) -> mjcf.RootElement:
-        """The box's MJCF."""
-        return self._mjcf_root
-
-    @property
     def radius(self) -> float:
         """Of the circle around its footprint [m]."""
         return float(self.size / np.sqrt(2))
-
-    def after_compile(self, physics: Any, random_state: np.random.RandomState) -> None:
-        """Finds the box's address in the compiled model."""
-        del random_state
-        self._mocap = int(physics.model.ptr.body(self._mjcf_root.full_identifier).mocapid[0])
-
-    def position(self, physics: Any) -> np.ndarray:
-        """Of its centre: x, y [m], float64 [2], in the world frame."""
-        return physics.data.ptr.mocap_pos[self._mocap, :2].copy()
-
-    def set_position(self, physics: Any, position: np.ndarray) -> None:
-        """Moves the box to x, y [m]; positions derived from it are stale until a forward."""
-        physics.data.ptr.mocap_pos[self._mocap, :2] = position
