@@ -20,6 +20,7 @@ from envs.navigate import navigate_2m, navigate_4m
 from envs.near_goal import collect_failed, collect_near_goal
 from envs.oracle import GoalRenderer
 from envs.pebble import find_pebble
+from envs.pick_and_place import pick_and_place_2m
 from envs.tasks.navigate import GOAL_OFFSET
 from envs.torchrl_env import ComposerEnv
 
@@ -40,6 +41,7 @@ __all__ = [
     "named",
     "navigate_2m",
     "navigate_4m",
+    "pick_and_place_2m",
 ]
 
 register_named()

@@ -6,6 +6,7 @@ al., NeurIPS 2019, section 4); every episode ends in a real success, and no imag
 """
 
 from collections import deque
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -74,18 +75,22 @@ def collect_near_goal(
     steps_before_goal: int = 32,
     noise: tuple[float, float] = _NOISE,
 ) -> dict[str, np.ndarray]:
-    """Collects the last states of successful rollouts of the privileged driver.
+    """Collects the last states before each goal of successful rollouts of the privileged driver.
+
+    The flags of a pose tell which goal its image shows near. Where flags change within a rollout, as at a pick-up, one
+    goal is reached and the next begins: each goal gives about as many snapshots.
 
     Args:
         environment: Where to drive; ends up mid-episode.
         count: Number of snapshots N.
         random_state: Source of the driver's noise; the starts are the environment's own.
-        steps_before_goal: States kept of each rollout besides its final one.
+        steps_before_goal: States kept of the way to each goal besides its last one.
         noise: Lowest and highest share of random actions near the goal.
 
     Returns:
-        ``pixels`` uint8 [N, H, W, 3], ``pose`` float32 [N, 3], and ``goal_pose`` float32 [N, 3]: the robot's final
-        pose of the same rollout.
+        ``pixels`` uint8 [N, H, W, 3], ``pose`` float32 [N, P], and ``goal_pose`` float32 [N, P]: where the robot stood
+        when it reached the goal, with the flags of ``pose``. The state in which a rollout succeeds is its own goal pose
+        and among the snapshots; one in which flags change is not, for its image shows the next goal.
 
     Raises:
         ValueError: if count or steps_before_goal is out of range.
@@ -98,10 +103,9 @@ def collect_near_goal(
     snapshots: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     failures = 0
     while len(snapshots) < count:
-        tail, succeeded = _drive(environment, driver, steps_before_goal + 1)
+        ways, succeeded = _drive(environment, driver, steps_before_goal + 1)
         if succeeded:
-            goal_pose = tail[-1][1]
-            snapshots += [(pixels, pose, goal_pose) for pixels, pose in tail]
+            snapshots += ways
             failures = 0
         else:
             failures += 1
@@ -115,7 +119,8 @@ def collect_failed(environment: Environment, count: int, random_state: np.random
     """Collects snapshots of episodes with uniformly random actions that do not succeed.
 
     Each action is held for a while: turns that are drawn anew at each step average out, and all walks end at a wall.
-    The goal may be in view: nobody looks.
+    The goal may be in view: nobody looks. A task with several goals gives as many snapshots of walks that start with
+    the one as of walks that start with the other, in this order.
 
     Args:
         environment: Where to wander; ends up mid-episode.
@@ -123,31 +128,46 @@ def collect_failed(environment: Environment, count: int, random_state: np.random
         random_state: Source of the actions; the starts are the environment's own.
 
     Returns:
-        ``pixels`` uint8 [M, H, W, 3] and ``pose`` float32 [M, 3].
+        ``pixels`` uint8 [M, H, W, 3] and ``pose`` float32 [M, P].
 
     Raises:
         ValueError: if count is out of range.
     """
     _check_count(count)
+    stages = environment.task.stages
     snapshots: list[tuple[np.ndarray, np.ndarray]] = []
-    while len(snapshots) < count:
-        episode, succeeded = _wander(environment, random_state)
-        snapshots += [] if succeeded else episode
-    return dict(zip(("pixels", "pose"), map(np.stack, zip(*snapshots[:count], strict=True)), strict=True))
+    for number, stage in enumerate(stages, start=1):
+        enough = count * number // len(stages)
+        while len(snapshots) < enough:
+            episode, succeeded = _wander(environment, stage, random_state)
+            snapshots += [] if succeeded else episode[: enough - len(snapshots)]
+    return dict(zip(("pixels", "pose"), map(np.stack, zip(*snapshots, strict=True)), strict=True))
 
 
 def _drive(environment: Environment, driver: NoisyDriver, keep: int) -> tuple[list[Any], bool]:
+    """One rollout: the last snapshots before each goal it reached, with its goal pose, and whether it succeeded."""
     driver.start_episode()
     timestep = environment.reset()
-    tail = deque([_snapshot(timestep)], maxlen=keep)
+    way = deque([_snapshot(timestep)], maxlen=keep)
+    ways: list[Any] = []
     while not timestep.last():
-        timestep = environment.step(driver.act(tail[-1][1]))
-        tail.append(_snapshot(timestep))
-    return list(tail), timestep.discount == 0.0
+        timestep = environment.step(driver.act(way[-1][1]))
+        pixels, pose = _snapshot(timestep)
+        if (pose[3:] != way[-1][1][3:]).any():
+            ways += _with_goal(way, pose)
+            way.clear()
+        way.append((pixels, pose))
+    return ways + _with_goal(way, pose), timestep.discount == 0.0
 
 
-def _wander(environment: Environment, random_state: np.random.RandomState) -> tuple[list[Any], bool]:
-    timestep = environment.reset()
+def _with_goal(way: Iterable[Any], goal_pose: np.ndarray) -> list[Any]:
+    return [(pixels, pose, np.append(goal_pose[:3], pose[3:])) for pixels, pose in way]
+
+
+def _wander(
+    environment: Environment, stage: Mapping[str, Any], random_state: np.random.RandomState
+) -> tuple[list[Any], bool]:
+    timestep = environment.reset_to(stage)
     episode = [_snapshot(timestep)]
     while not timestep.last():
         if (len(episode) - 1) % _HOLD == 0:

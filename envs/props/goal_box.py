@@ -1,10 +1,15 @@
-"""GoalBox: the red cube that the robot must find."""
+"""GoalBox: a coloured cube that the robot must find."""
+
+from typing import Any
 
 import numpy as np
 from dm_control import mjcf
 
 from envs.contact import CONTACT
 from envs.props.mocap_prop import MocapProp
+
+RED = (0.85, 0.08, 0.06, 1.0)
+GREEN = (0.05, 0.62, 0.10, 1.0)
 
 
 class GoalBox(MocapProp):
@@ -19,9 +24,7 @@ class GoalBox(MocapProp):
         ValueError: if the size is not positive.
     """
 
-    def _build(
-        self, size: float = 0.08, rgba: tuple[float, ...] = (0.85, 0.08, 0.06, 1.0), name: str = "goal_box"
-    ) -> None:
+    def _build(self, size: float = 0.08, rgba: tuple[float, ...] = RED, name: str = "goal_box") -> None:
         if size <= 0:
             raise ValueError(f"size must be positive; got {size} m.")
         self.size = size
@@ -35,3 +38,13 @@ class GoalBox(MocapProp):
     def radius(self) -> float:
         """Of the circle around its footprint [m]."""
         return float(self.size / np.sqrt(2))
+
+    def after_compile(self, physics: Any, random_state: np.random.RandomState) -> None:
+        """Finds the box's addresses in the compiled model."""
+        super().after_compile(physics, random_state)
+        self._geom = int(physics.model.ptr.body(self._mjcf_root.full_identifier).geomadr[0])
+
+    def set_solid(self, physics: Any, solid: bool) -> None:
+        """Lets things collide with the box, or pass through it."""
+        physics.model.ptr.geom_contype[self._geom] = solid
+        physics.model.ptr.geom_conaffinity[self._geom] = solid

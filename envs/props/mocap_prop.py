@@ -35,6 +35,10 @@ class MocapProp(composer.Entity):
         """Of its centre: x, y [m], float64 [2], in the world frame."""
         return physics.data.ptr.mocap_pos[self._mocap, :2].copy()
 
-    def set_position(self, physics: Any, position: np.ndarray) -> None:
-        """Moves the prop to x, y [m]; positions derived from it are stale until a forward."""
-        physics.data.ptr.mocap_pos[self._mocap, :2] = position
+    def set_position(self, physics: Any, position: np.ndarray, *, yaw: float = 0.0, height: float = 0.0) -> None:
+        """Moves the prop to x, y [m], turned by yaw [rad], its bottom at height [m].
+
+        Positions derived from it are stale until a forward.
+        """
+        physics.data.ptr.mocap_pos[self._mocap] = *position, height
+        physics.data.ptr.mocap_quat[self._mocap] = np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)

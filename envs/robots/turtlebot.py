@@ -39,7 +39,7 @@ _SERVO_GAIN = 0.12
 """Torque for each rad/s that a wheel is too slow [N m s]: gets up to speed within about 0.1 s."""
 
 _BUMPER = {"condim": 3, "friction": [0.2, 0.005, 0.0001]}
-"""The base touches with a little friction: it would pivot freely about what it runs into, stalled wheels hold nothing."""
+"""The base touches with a little friction: stalled wheels would let it pivot freely at what it runs into."""
 
 FORWARD, LEFT, RIGHT, BACKWARD = range(4)
 """The actions that ``MOTIONS`` defines."""

@@ -10,7 +10,7 @@ def read_start(start: Mapping[str, Any], entries: Mapping[str, tuple[str, ...]])
     """Reads named vectors.
 
     Args:
-        start: What is fixed: any of the names that the task knows, each with its numbers.
+        start: What is fixed: any of the names that the task knows, each with its numbers; one may be a bare number.
         entries: The names that the task knows, each with what its entries mean.
 
     Returns:
@@ -30,11 +30,13 @@ def read_start(start: Mapping[str, Any], entries: Mapping[str, tuple[str, ...]])
 
 def _vector(name: str, value: Any, entries: tuple[str, ...]) -> np.ndarray:
     try:
-        vector = np.array(value, np.float64)
+        vector = np.atleast_1d(np.array(value, np.float64))
     except (TypeError, ValueError):
         vector = np.array(np.nan)
     if vector.shape != (len(entries),) or not np.isfinite(vector).all():
-        raise ValueError(
-            f"{name}={value!r} must be {len(entries)} finite numbers, {', '.join(entries)}; leave it out to draw it."
-        )
+        raise ValueError(f"{name}={value!r} must be {_count(entries)}, {', '.join(entries)}; leave it out to draw it.")
     return vector
+
+
+def _count(entries: tuple[str, ...]) -> str:
+    return "one finite number" if len(entries) == 1 else f"{len(entries)} finite numbers"

@@ -18,6 +18,7 @@ _OUT_OF_SIGHT = np.array([0.0, 100.0])
 
 _POSE = {"pose": ("x [m]", "y [m]", "yaw [rad]")}
 _POSITION = ("x [m]", "y [m]")
+_FLAG = ("0 or 1",)
 _MAX_DRAWS = 10_000
 _WALL_CLEARANCE = 0.02
 """Between the robot and a wall at the start of an episode [m]."""
@@ -44,7 +45,7 @@ class GoalTask(composer.Task):
         physics_timestep: Seconds a physics substep.
 
     Raises:
-        ValueError: if the room is too small for the start distances.
+        ValueError: if the room is too small for the start distances, or they are so small that episodes start solved.
     """
 
     mission: str
@@ -98,6 +99,12 @@ class GoalTask(composer.Task):
         return observables
 
     def _check_room(self) -> None:
+        reached = max(goal.distance for goal in self.goals.values())
+        if not self.min_start_distance > reached:
+            raise ValueError(
+                f"min_start_distance={self.min_start_distance} m must exceed {reached} m, from where a goal counts as "
+                "reached, or episodes start solved."
+            )
         robot_range, box_range = self._robot_range, self._box_range
         widest = {
             "min_start_distance": np.hypot(*(np.maximum(robot_range, 0) + np.maximum(box_range, 0))),
@@ -190,20 +197,27 @@ class GoalTask(composer.Task):
 
         Args:
             start: Any of ``pose``, the robot's x [m], y [m], yaw [rad], and of the names of ``goals``, each box's
-                x [m], y [m]. Things that are given may be closer to each other than drawn ones.
+                x [m], y [m], and of the flags, 0 or 1. Things that are given may be closer to each other than drawn
+                ones. A flag that is not given is 0.
 
         Raises:
             ValueError: if a name is unknown, numbers are missing or not finite, something is not in the room, or two
                 things overlap. What was fixed before then stays fixed.
         """
-        fixed = read_start(start, _POSE | dict.fromkeys(self.goals, _POSITION))
+        fixed = read_start(start, _POSE | dict.fromkeys(self.goals, _POSITION) | dict.fromkeys(self.flags, _FLAG))
+        self._check_start(fixed)
+        self._fixed = fixed
+
+    def _check_start(self, fixed: Mapping[str, np.ndarray]) -> None:
         self._check_in_room("pose", fixed, self.robot.radius)
         for name, goal in self.goals.items():
             self._check_in_room(name, fixed, goal.box.size / 2)
             self._check_robot_apart(name, fixed)
         for one, other in combinations(self.goals, 2):
             self._check_boxes_apart(one, other, fixed)
-        self._fixed = fixed
+        for flag in self.flags:
+            if flag in fixed and fixed[flag] not in (0, 1):
+                raise ValueError(f"{flag}={fixed[flag].item():g} must be 0 or 1.")
 
     def _check_in_room(self, name: str, fixed: Mapping[str, np.ndarray], extent: float) -> None:
         x, y = self.arena.half_extent - extent

@@ -21,7 +21,7 @@ class FindPebble(SingleGoalTask):
         pebble: The goal; starts call it ``pebble``.
         min_start_distance: Between robot and pebble at the start of an episode [m].
         success_distance: [m].
-        nearest: [m]; not much farther ahead than where the robot's camera loses sight of the ground.
+        nearest: Closer than this the pebble is out of the image, or about to be [m].
         centring_tolerance: [m].
         energy_cost: See :class:`GoalTask`.
         control_timestep: Seconds a step.

@@ -29,11 +29,6 @@ class SingleGoalTask(GoalTask):
     ) -> None:
         self._goal = goal
         goal.check(robot.radius, distance_name="success_distance", tolerance_name="centring_tolerance")
-        if not min_start_distance > goal.distance:
-            raise ValueError(
-                f"min_start_distance={min_start_distance} m must exceed success_distance={goal.distance} m, "
-                "or episodes start solved."
-            )
         super().__init__(robot, arena, {name: goal}, min_start_distance=min_start_distance, **kwargs)
 
     def goal(self, pose: np.ndarray) -> Goal:

@@ -36,7 +36,11 @@ def test_every_named_environment_passes_gymnasium_s_check_without_a_warning(name
 
 
 def test_every_name_has_an_id_by_one_rule():
-    assert IDS == {"navigate-2m": "halgan_rl/Navigate2m-v0", "navigate-4m": "halgan_rl/Navigate4m-v0"}
+    assert IDS == {
+        "navigate-2m": "halgan_rl/Navigate2m-v0",
+        "navigate-4m": "halgan_rl/Navigate4m-v0",
+        "pick-and-place-2m": "halgan_rl/PickAndPlace2m-v0",
+    }
     registered = {id_ for id_ in gymnasium.registry if id_.startswith("halgan_rl/")}
     assert registered == set(IDS.values())
     assert {gymnasium.spec(id_).kwargs["name"] for id_ in registered} == set(envs.NAMES)
@@ -53,8 +57,10 @@ def test_spaces_are_those_of_the_data_contract(name):
     env = gymnasium.make(IDS[name])
     pixels, pose = env.observation_space["pixels"], env.observation_space["pose"]
     assert (pixels.shape, pixels.dtype, pixels.low.min(), pixels.high.max()) == ((64, 64, 3), np.uint8, 0, 255)
-    half = env.unwrapped.environment.task.arena.size / 2
-    assert (pose.dtype, pose.high.tolist()) == (np.float32, pytest.approx([half, half, np.pi]))
+    task = env.unwrapped.environment.task
+    half, flags = task.arena.size / 2, [1.0] * len(task.flags)
+    assert (pose.dtype, pose.high.tolist()) == (np.float32, pytest.approx([half, half, np.pi, *flags]))
+    assert pose.low.tolist() == pytest.approx([-half, -half, -np.pi, *(0 * flag for flag in flags)])
     assert env.action_space == gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
     assert env.metadata["render_fps"] == 10
     env.close()

@@ -59,12 +59,14 @@ def test_starts_are_far_apart_free_and_reachable(named_environment):
     task, random_state = named_environment.task, np.random.RandomState(0)
     half, nearest = task.arena.size / 2, {2.0: 0.5, 4.0: 1.0}[task.arena.size]
     for _ in range(2000):
-        pose, box = task.draw_start(random_state).values()
-        assert np.hypot(*(pose[:2] - box)) >= nearest
+        start = task.draw_start(random_state)
+        pose = start["pose"]
         assert np.abs(pose[:2]).max() <= half - task.robot.radius
-        # Room for the robot between box and wall.
-        assert np.abs(box).max() <= half - task.goals["box"].box.radius - 2 * task.robot.radius
         assert -np.pi <= pose[2] <= np.pi
+        for name, goal in task.goals.items():
+            assert np.hypot(*(pose[:2] - start[name])) >= nearest
+            # Room for the robot between box and wall.
+            assert np.abs(start[name]).max() <= half - goal.box.radius - 2 * task.robot.radius
 
 
 def test_episodes_start_without_contact(named_environment):
@@ -79,7 +81,7 @@ def test_every_named_environment_keeps_its_spec(named_environment):
     timestep = named_environment.reset()
     assert {name: (s.shape, s.dtype) for name, s in spec.items()} == {
         "pixels": ((64, 64, 3), np.uint8),
-        "pose": ((3,), np.float32),
+        "pose": ((3 + len(named_environment.task.flags),), np.float32),
     }
     for _ in range(20):
         for name, value in timestep.observation.items():
@@ -92,9 +94,14 @@ def test_the_rooms_have_the_paper_s_size_and_the_small_one():
     sizes = {}
     for name, build in envs.NAMES.items():
         environment = build(random_state=0)
-        sizes[name] = (environment.task.arena.size, environment.task.goals["box"].tolerance)
+        task = environment.task
+        sizes[name] = (task.arena.size, *(goal.tolerance for goal in task.goals.values()))
         environment.close()
-    assert sizes == {"navigate-4m": (4.0, 0.01), "navigate-2m": (2.0, 0.02)}
+    assert sizes == {
+        "navigate-4m": (4.0, 0.01),
+        "navigate-2m": (2.0, 0.02),
+        "pick-and-place-2m": (2.0, 0.02, 0.02),
+    }
 
 
 def test_a_reset_never_recompiles(room_2m):
@@ -131,7 +138,7 @@ def run_episode(environment):
         ({"size": 0.3, "min_start_distance": 0.2}, "too small"),
         ({"success_distance": 0.05}, "success_distance=0.05 m cannot be reached"),
         ({"centring_tolerance": 0.0}, "centring_tolerance must be positive; got 0.0"),
-        ({"min_start_distance": 0.1}, "min_start_distance=0.1 m must exceed success_distance=0.16"),
+        ({"min_start_distance": 0.1}, "min_start_distance=0.1 m must exceed 0.16 m"),
         ({"min_start_distance": float("nan")}, "min_start_distance=nan"),
     ],
 )
