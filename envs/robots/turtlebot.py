@@ -38,6 +38,11 @@ _MAX_TORQUE = 0.5
 _SERVO_GAIN = 0.12
 """Torque for each rad/s that a wheel is too slow [N m s]: gets up to speed within about 0.1 s."""
 
+_ARMATURE = 0.001
+"""Of a motor, behind its gear [kg m^2]; keeps the light wheels from spinning when they start."""
+_SINK = 3e-5
+"""How deep the wheels stand in the ground at rest [m]."""
+
 _BUMPER = {"condim": 3, "friction": [0.2, 0.005, 0.0001]}
 """The base touches with a little friction: stalled wheels would let it pivot freely at what it runs into."""
 
@@ -121,13 +126,13 @@ class TurtleBot(SightedRobot):
 
     def _build_wheel(self, name: str, y: float) -> None:
         wheel = self._base.add("body", name=f"{name}_wheel", pos=[0, y, WHEEL_RADIUS])
-        wheel.add("joint", name=name, type="hinge", axis=[0, 1, 0])
+        wheel.add("joint", name=name, type="hinge", axis=[0, 1, 0], armature=_ARMATURE)
         rolling = _WHEEL_MASS * WHEEL_RADIUS**2 / 2
         wheel.add("inertial", pos=[0, 0, 0], mass=_WHEEL_MASS, diaginertia=[rolling / 2, rolling, rolling / 2])
         # A sphere touches the ground in one point, half a wheel base from the centre.
         wheel.add(
             "geom", name=f"{name}_tyre", type="sphere", size=[WHEEL_RADIUS], group=HIDDEN, condim=3,
-            friction=[1.0, 0.005, 0.0001], priority=1, solref=[0.01, 1],
+            friction=[1.0, 0.005, 0.0001], priority=1, solref=[0.01, 1], solimp=[0.99, 0.999, 0.001, 0.5, 2],
         )  # fmt: skip
         self._decorate(
             "cylinder", [WHEEL_RADIUS, 0.012], [0, 0, 0], [0.06, 0.06, 0.06, 1], wheel, euler=[np.pi / 2, 0, 0]
@@ -196,7 +201,7 @@ class TurtleBot(SightedRobot):
     def set_pose(self, physics: Any, pose: np.ndarray) -> None:
         """Places the robot on its wheels, at rest, at x [m], y [m], yaw [rad]; what derives from it is then stale."""
         x, y, yaw = pose
-        physics.data.ptr.qpos[self._qpos] = x, y, 0.0, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)
+        physics.data.ptr.qpos[self._qpos] = x, y, -_SINK, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)
         physics.data.ptr.qpos[self._wheels] = 0.0
         physics.data.ptr.qvel[self._dofs] = 0.0
 
@@ -217,6 +222,4 @@ def _check_motions(motions: np.ndarray) -> None:
     if not (np.abs(motions).max(axis=0) > 0).all():
         raise ValueError(f"Some motion must drive, and some must turn; got {motions.tolist()}.")
     if not (np.abs(motions) <= (MAX_SPEED, MAX_TURN_RATE)).all():
-        raise ValueError(
-            f"A TurtleBot2 drives at most {MAX_SPEED} m/s and turns 180 degrees/s; got {motions.tolist()}."
-        )
+        raise ValueError(f"A TurtleBot2 reaches {MAX_SPEED} m/s and {MAX_TURN_RATE:.3f} rad/s; got {motions.tolist()}.")
