@@ -8,7 +8,7 @@ from envs.arenas.arena import WALL_GROUP, Arena
 from envs.contact import CONTACT
 
 _WALLS = (
-    # name, direction of the outward normal, two colours: no red, which is the goal's.
+    # name, direction of the outward normal, two colours: none bright, as the goals are.
     ("east", 0.0, (0.36, 0.48, 0.60), (0.44, 0.56, 0.68)),
     ("north", 0.5 * np.pi, (0.42, 0.55, 0.42), (0.50, 0.64, 0.50)),
     ("west", np.pi, (0.66, 0.60, 0.42), (0.74, 0.68, 0.50)),

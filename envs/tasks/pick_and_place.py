@@ -21,7 +21,7 @@ class PickAndPlace(GoalTask):
     The pick-up pays nothing and ends nothing: it sets the flag ``held``, the fourth entry of ``pose``, already in the
     observation of the step that led to it. From then on the red box sits on the robot's front, in view of the camera at
     the lower edge, and collides with nothing. With ``held`` 0 the red box is the goal, with ``held`` 1 the green one
-    (the "successive navigation" of Sahni et al., NeurIPS 2019, section 5.3 and appendix).
+    (the "successive navigation" of Sahni et al., NeurIPS 2019).
 
     Close is, by default, the radius of the box's footprint plus the robot's plus 1.1 steps of 0.05 m.
 

@@ -344,7 +344,7 @@ def test_poses_without_the_flag_are_refused(renderer):
 @pytest.fixture(scope="module")
 def near_goal():
     environment = envs.pick_and_place_2m(random_state=1)
-    snapshots = collect_near_goal(environment, 300, np.random.RandomState(2), steps_before_goal=15)
+    snapshots = collect_near_goal(environment, 300, np.random.RandomState(2), steps_before_goal=40)
     environment.close()
     return snapshots
 
@@ -362,7 +362,7 @@ def test_near_goal_snapshots_come_from_both_stages_alike(near_goal):
 def test_a_near_goal_snapshot_and_its_goal_pose_have_one_flag_and_are_near_each_other(near_goal):
     pose, goal_pose = near_goal["pose"], near_goal["goal_pose"]
     np.testing.assert_array_equal(pose[:, 3], goal_pose[:, 3])
-    assert (np.hypot(*(pose - goal_pose)[:, :2].T) <= 16 * 0.05 + 1e-6).all()
+    assert (np.hypot(*(pose - goal_pose)[:, :2].T) <= 41 * 0.05 + 1e-6).all()
     # The delivery is among its snapshots; the pick-up is not: there the red box is carried already.
     same = (pose == goal_pose).all(axis=1)
     assert set(pose[same, 3]) == {1.0}
