@@ -15,7 +15,7 @@ BODY_GROUP = 2
 """Group of all of the robot that can be seen; its own camera leaves it out, since it would see nothing of it."""
 
 RADIUS = 0.177
-"""Of the round base [m]; this and the following: Kobuki's and TurtleBot2's public data sheets."""
+"""Of the round base [m]; this and the following are those of a Kobuki base, which a TurtleBot2 is built on."""
 WHEEL_RADIUS = 0.038
 """[m]."""
 WHEEL_BASE = 0.23
@@ -50,14 +50,19 @@ FORWARD, LEFT, RIGHT, BACKWARD = range(4)
 """The actions that ``MOTIONS`` defines."""
 
 MOTIONS = ((0.4, 0.0), (0.0, np.deg2rad(48.0)), (0.0, -np.deg2rad(48.0)), (-0.4, 0.0))
-"""Forward speed [m/s] and turn rate [rad/s] of each action: in 0.25 s, 0.1 m or 12 degrees."""
+"""Forward speed [m/s] and turn rate [rad/s] of each action: in 0.25 s, 0.1 m or 12 degrees.
+
+The paper's network for the TurtleBot has four outputs (Sahni et al., NeurIPS 2019, appendix). The fourth is taken to be
+backward here: a robot that came too close needs it.
+"""
 
 
 class TurtleBot(SightedRobot):
     """A Kobuki base with plates on poles, two driven wheels, two casters, and an egocentric camera; a free body.
 
-    Nothing but friction at the wheels moves it: an action is a pair of wheel speeds that servos hold for a step. The
-    camera sits in front of the poles and looks over the base, so the robot never sees itself.
+    Nothing but friction at the wheels moves it: an action is a pair of wheel speeds that servos hold for a step. It gets
+    up to speed, and stops, within about 0.1 s, so the first step of a motion is shorter and another motion fades into
+    it. The camera sits in front of the poles and looks over the base, so the robot never sees itself.
 
     Args:
         motions: Forward speed [m/s] and turn rate (positive is left) [rad/s] of each action, by default ``MOTIONS``.
@@ -68,7 +73,7 @@ class TurtleBot(SightedRobot):
         name: Name of the entity.
 
     Raises:
-        ValueError: if a motion is faster than a TurtleBot2.
+        ValueError: if no motion drives, none turns, or one is faster than a TurtleBot2.
     """
 
     def _build(

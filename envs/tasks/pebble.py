@@ -12,8 +12,8 @@ class FindPebble(SingleGoalTask):
 
     Close: the pebble is between ``nearest`` and ``success_distance`` from the robot's centre, which is one step of
     driving, and near the lower edge of the image. In the middle: at most ``centring_tolerance`` beside the optical
-    axis, which one turn of 12 degrees always achieves there. The paper (Sahni et al., NeurIPS 2019, section 5)
-    publishes none of these numbers.
+    axis, which turns of 12 degrees always achieve there. The task is that of Sahni et al. (NeurIPS 2019); the numbers
+    are chosen for this robot and its steps.
 
     Args:
         robot: The robot.
