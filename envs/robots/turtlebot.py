@@ -60,9 +60,9 @@ backward here: a robot that came too close needs it.
 class TurtleBot(SightedRobot):
     """A Kobuki base with plates on poles, two driven wheels, two casters, and an egocentric camera; a free body.
 
-    Nothing but friction at the wheels moves it: an action is a pair of wheel speeds that servos hold for a step. It gets
-    up to speed, and stops, within about 0.1 s, so the first step of a motion is shorter and another motion fades into
-    it. The camera sits in front of the poles and looks over the base, so the robot never sees itself.
+    Nothing but friction at the wheels moves it: an action is a pair of wheel speeds that servos hold for a step. To get
+    up to speed or to stop takes about 0.1 s, so the first step of a motion is shorter, and the motion before fades out
+    in it. The camera sits in front of the poles and looks over the base: the robot never sees itself.
 
     Args:
         motions: Forward speed [m/s] and turn rate (positive is left) [rad/s] of each action, by default ``MOTIONS``.
