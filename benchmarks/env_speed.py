@@ -20,6 +20,7 @@ import torch
 import envs
 from benchmarks.tables import Table, report
 from envs.environment import Environment
+from envs.transition import random_action
 
 
 def bare_renderer(name: str, steps: int) -> Callable[[], None]:
@@ -63,7 +64,8 @@ VARIANTS = {
 
 def stepping(environment: Environment, steps: int) -> Callable[[], None]:
     """A run of random steps; composer resets by itself after an episode."""
-    actions = np.random.RandomState(0).uniform(-1, 1, size=(steps, 2))
+    random_state = np.random.RandomState(0)
+    actions = [random_action(environment.action_spec(), random_state) for _ in range(steps)]
     return lambda: [environment.step(action) for action in actions][:0]
 
 

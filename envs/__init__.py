@@ -19,6 +19,7 @@ from envs.names import NAMES, goal_offsets, named
 from envs.navigate import navigate_2m, navigate_4m
 from envs.near_goal import collect_failed, collect_near_goal
 from envs.oracle import GoalRenderer
+from envs.pebble import find_pebble
 from envs.pick_and_place import pick_and_place_2m
 from envs.torchrl_env import ComposerEnv
 
@@ -30,6 +31,7 @@ __all__ = [
     "GymnasiumEnv",
     "collect_failed",
     "collect_near_goal",
+    "find_pebble",
     "fingerprint",
     "goal_offsets",
     "gl_backend",

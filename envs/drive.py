@@ -8,7 +8,6 @@ import tyro
 
 from envs.environment import Environment
 from envs.names import named
-from envs.robots.rover import Rover
 from envs.transition import read
 
 
@@ -26,11 +25,20 @@ class ArrowKeys:
         """Forgets a key."""
         self._held.discard(event.key)
 
-    def action(self, robot: Rover) -> np.ndarray:
-        """An action [2]: up and down drive at full speed, left and right turn at the full rate, no key stands still."""
+    def action(self, robot: Any) -> Any:
+        """An action: up and down drive at full speed, left and right turn at the full rate, no key stands still.
+
+        Args:
+            robot: Who acts.
+
+        Returns:
+            The action; None if no key is held and the robot has no action that stands still.
+        """
         forward, turn = self._axis("up", "down"), self._axis("left", "right")
         speed = forward * (robot.max_speed if forward > 0 else robot.reverse_speed)
-        return robot.action_for(speed, turn * robot.max_turn_rate)
+        action = robot.action_for(speed, turn * robot.max_turn_rate)
+        stands_still = np.allclose(robot.velocities(action), 0.0)
+        return action if speed or turn or stands_still else None
 
     def _axis(self, positive: str, negative: str) -> int:
         return (positive in self._held) - (negative in self._held)
@@ -42,14 +50,22 @@ class Cockpit:
     def __init__(self, environment: Environment) -> None:
         self._environment = environment
         self._keys = ArrowKeys()
+        self._is_shown = False
         self.figure, self._axes = plt.subplots(1, 2, figsize=(10, 4.5))
         self.figure.canvas.mpl_connect("key_press_event", self._keys.press)
         self.figure.canvas.mpl_connect("key_release_event", self._keys.release)
 
     def tick(self) -> None:
-        """Takes a step, or starts the next episode after an end, and shows where it led."""
+        """Takes a step, or starts the next episode after an end, and shows where it led.
+
+        A robot that cannot stand still waits for a key.
+        """
         task = self._environment.task
-        transition = read(self._environment.step(self._keys.action(task.robot)))
+        action = self._keys.action(task.robot)
+        if action is None and self._is_shown:
+            return
+        self._is_shown = True
+        transition = read(self._environment.step(action))
         for axes, image in zip(self._axes, (transition.pixels, self._environment.render_overview()), strict=True):
             axes.clear()
             axes.imshow(image)

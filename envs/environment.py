@@ -30,6 +30,11 @@ class Environment(composer.Environment):
             recompile_mjcf_every_episode=False,
         )
         self._overview: PersistentCamera | None = None
+        self._action_spec = task.action_spec(self.physics)
+
+    def action_spec(self) -> Any:
+        """Of the task, made once."""
+        return self._action_spec
 
     def reset_to(self, start: Mapping[str, Any]) -> Any:
         """Starts an episode from a fixed start; later episodes are drawn again.

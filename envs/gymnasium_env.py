@@ -11,13 +11,13 @@ from envs.names import NAMES, named
 from envs.transition import Transition, advance, read
 
 
-class GymnasiumEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
+class GymnasiumEnv(gymnasium.Env[dict[str, Any], Any]):
     """A named environment as a Gymnasium environment.
 
     Observations are a dict of ``pixels`` uint8 [64, 64, 3] and ``pose`` float32 [P] (x [m], y [m], yaw [rad], then the
-    flags of the task), actions float32 [2] in [-1, 1]: forward speed and turn rate. Success terminates and sets
-    ``is_success`` in the info; the environment's own time limit truncates. An episode equals that of the TorchRL face
-    with the same seed.
+    flags of the task), actions float32 [2] in [-1, 1]: forward speed and turn rate; or integers where they are
+    discrete. Success terminates and sets ``is_success`` in the info; the environment's own time limit truncates. An
+    episode equals that of the TorchRL face with the same seed.
 
     An OpenGL context lives in one process and, with EGL, on one thread: spawn the workers of vectorised environments,
     ``gymnasium.make_vec(..., vectorization_mode="async", vector_kwargs={"context": "spawn"})``.
@@ -40,7 +40,7 @@ class GymnasiumEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         task = self.environment.task
         self.metadata = {**self.metadata, "render_fps": round(1 / task.control_timestep)}
         self.observation_space = _observation_space(task.robot.image_size, task.pose_spec)
-        self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self.action_space = _action_space(self.environment.action_spec())
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -64,14 +64,14 @@ class GymnasiumEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         transition = read(self.environment.reset_to(options or {}))
         return _observation(transition), _info(transition)
 
-    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
-        """Takes an action [2] for one step.
+    def step(self, action: Any) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """Takes an action for one step.
 
         Returns:
             Observation, reward, terminated, truncated, info.
 
         Raises:
-            ValueError: if the action is not two numbers in [-1, 1].
+            ValueError: if the action is not in the action space.
             RuntimeError: if the episode is over.
         """
         transition = advance(self.environment, np.asarray(action))
@@ -112,6 +112,12 @@ def _observation_space(image_size: tuple[int, int], pose: specs.BoundedArray) ->
         pixels=spaces.Box(0, 255, (*image_size, 3), np.uint8),
         pose=spaces.Box(pose.minimum, pose.maximum, dtype=np.float32),
     )
+
+
+def _action_space(spec: specs.Array) -> spaces.Space:
+    if isinstance(spec, specs.DiscreteArray):
+        return spaces.Discrete(spec.num_values)
+    return spaces.Box(-1.0, 1.0, spec.shape, np.float32)
 
 
 def _observation(transition: Transition) -> dict[str, np.ndarray]:

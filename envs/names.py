@@ -4,11 +4,13 @@ from collections.abc import Callable
 
 from envs.environment import Environment
 from envs.navigate import navigate_2m, navigate_4m
+from envs.pebble import find_pebble
 from envs.pick_and_place import pick_and_place_2m
 
 NAMES: dict[str, Callable[..., Environment]] = {
     "navigate-2m": navigate_2m,
     "navigate-4m": navigate_4m,
+    "pebble": find_pebble,
     "pick-and-place-2m": pick_and_place_2m,
 }
 """Functions that take ``random_state`` and ``time_limit`` [s] and build an environment."""

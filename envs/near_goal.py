@@ -13,9 +13,10 @@ import numpy as np
 
 from envs.environment import Environment
 from envs.tasks.goal import in_robot_frame
+from envs.transition import random_action
 
-_CALM_DISTANCE = 0.35
-"""Farther from the goal than this [m] the driver wanders little."""
+_CALM_DISTANCE = 2.5
+"""Farther from the goal than this, in units of the goal's offset, the driver wanders little."""
 _FAR_NOISE = 0.2
 """Share of random actions there."""
 _NOISE = (0.6, 1.0)
@@ -48,21 +49,22 @@ class NoisyDriver:
         """Draws this episode's noise."""
         self._noise = self._random_state.uniform(*self._range)
 
-    def act(self, pose: np.ndarray) -> np.ndarray:
-        """An action [2] for a robot at pose [P]."""
+    def act(self, pose: np.ndarray) -> Any:
+        """An action for a robot at pose [P]."""
         task = self._environment.task
         ahead, left = in_robot_frame(pose, task.goal_position(self._environment.physics))
-        noise = self._noise if np.hypot(ahead, left) < _CALM_DISTANCE else _FAR_NOISE
+        goal = task.goal(pose)
+        noise = self._noise if np.hypot(ahead, left) < _CALM_DISTANCE * goal.offset else _FAR_NOISE
         if self._random_state.uniform() < noise:
-            return self._random_state.uniform(-1, 1, size=2)
-        return self._steer(ahead, left, task.goal(pose).distance)
+            return random_action(self._environment.action_spec(), self._random_state)
+        return self._steer(ahead, left, goal.distance)
 
-    def _steer(self, ahead: float, left: float, distance: float) -> np.ndarray:
+    def _steer(self, ahead: float, left: float, distance: float) -> Any:
         task = self._environment.task
         bearing = np.arctan2(left, ahead)
         gap = np.hypot(ahead, left) - 0.9 * distance
         speed = gap / task.control_timestep if abs(bearing) < 0.5 else 0.0
-        return task.robot.action_for(max(speed, 0.0), bearing / task.control_timestep)
+        return task.robot.action_for(speed, bearing / task.control_timestep)
 
 
 def collect_near_goal(
@@ -169,7 +171,7 @@ def _wander(
     episode = [_snapshot(timestep)]
     while not timestep.last():
         if (len(episode) - 1) % _HOLD == 0:
-            action = random_state.uniform(-1, 1, size=2)
+            action = random_action(environment.action_spec(), random_state)
         timestep = environment.step(action)
         episode.append(_snapshot(timestep))
     return episode, timestep.discount == 0.0

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from envs.arenas.walled_room import WALL_GROUP
+from envs.arenas.arena import WALL_GROUP
 from envs.environment import Environment
 from envs.names import named
 

@@ -4,8 +4,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from dm_env import specs
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Composite, OneHot, Unbounded
 from torchrl.envs import EnvBase
 
 from envs.environment import Environment
@@ -15,10 +16,11 @@ from envs.transition import Transition, advance, read
 class ComposerEnv(EnvBase):
     """A composer environment as a TorchRL environment.
 
-    Reads ``action`` float32 [2]; writes ``pixels`` uint8 [64, 64, 3], ``pose`` float32 [P] (x [m], y [m], yaw [rad],
-    then the flags of the task), ``reward`` float32 [1], and ``done``, ``terminated``, ``truncated`` bool [1]. Success
-    terminates; the time limit truncates. Pickle a factory such as ``functools.partial(envs.make, "navigate-2m")``, not
-    the environment: an OpenGL context lives in one process and, with EGL, on one thread.
+    Reads ``action``, float32 [2], or one-hot int64 [A] where actions are discrete; writes ``pixels`` uint8 [64, 64, 3],
+    ``pose`` float32 [P] (x [m], y [m], yaw [rad], then the flags of the task), ``reward`` float32 [1], and ``done``,
+    ``terminated``, ``truncated`` bool [1]. Success terminates; the time limit truncates. Pickle a factory such as
+    ``functools.partial(envs.make, "navigate-2m")``, not the environment: an OpenGL context lives in one process and,
+    with EGL, on one thread.
 
     Args:
         environment: The environment, owned and closed by this one.
@@ -36,7 +38,8 @@ class ComposerEnv(EnvBase):
             pixels=Bounded(0, 255, shape=(height, width, 3), dtype=torch.uint8),
             pose=Unbounded(shape=self.environment.task.pose_spec.shape, dtype=torch.float32),
         )
-        self.action_spec = Bounded(-1.0, 1.0, shape=(2,), dtype=torch.float32)
+        self.action_spec = _action_spec(self.environment.action_spec())
+        self._is_one_hot = isinstance(self.action_spec, OneHot)
         self.reward_spec = Unbounded(shape=(1,), dtype=torch.float32)
         self.done_spec = Composite(
             done=Binary(1, shape=(1,), dtype=torch.bool),
@@ -49,7 +52,8 @@ class ComposerEnv(EnvBase):
         return self._pack(read(self.environment.reset()))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        transition = advance(self.environment, tensordict["action"].numpy())
+        action = tensordict["action"].numpy()
+        transition = advance(self.environment, _choice(action) if self._is_one_hot else action)
         out = self._pack(transition)
         out.set("reward", torch.tensor([transition.reward], dtype=torch.float32))
         return out
@@ -79,3 +83,15 @@ class ComposerEnv(EnvBase):
         """Frees cameras and physics."""
         super().close(raise_if_closed=raise_if_closed)
         self.environment.close()
+
+
+def _action_spec(spec: specs.Array) -> Bounded | OneHot:
+    if isinstance(spec, specs.DiscreteArray):
+        return OneHot(spec.num_values, dtype=torch.int64)
+    return Bounded(-1.0, 1.0, shape=spec.shape, dtype=torch.float32)
+
+
+def _choice(action: np.ndarray) -> Any:
+    if action.ndim != 1 or np.count_nonzero(action) != 1 or action.sum() != 1:
+        raise ValueError(f"An action is one-hot, a single 1 among zeros; got {action.tolist()}.")
+    return action.argmax()

@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 import numpy as np
+from dm_env import specs
 
 from envs.environment import Environment
 
@@ -38,13 +39,15 @@ def read(timestep: Any) -> Transition:
 
 
 def advance(environment: Environment, action: np.ndarray) -> Transition:
-    """Takes one step with an action [2].
+    """Takes one step with an action: [2], or the number of a discrete one.
 
     Raises:
-        ValueError: if the action is not one, see :func:`checked_action`.
+        ValueError: if the action is not one, see :func:`checked_action` and :func:`checked_choice`.
         RuntimeError: if no episode is going on.
     """
-    timestep = environment.step(checked_action(action))
+    spec = environment.action_spec()
+    is_choice = isinstance(spec, specs.DiscreteArray)
+    timestep = environment.step(checked_choice(action, spec.num_values) if is_choice else checked_action(action))
     if timestep.first():
         raise RuntimeError("The episode is over: call reset before the next step.")
     return read(timestep)
@@ -65,3 +68,28 @@ def checked_action(action: np.ndarray) -> np.ndarray:
     if not abs(action).max() <= 1 + _OVERSHOOT:
         raise ValueError(f"Actions must lie in [-1, 1]; got {action.tolist()}: squash or clamp the policy's output.")
     return np.clip(action, -1.0, 1.0)
+
+
+def checked_choice(action: np.ndarray, count: int) -> int:
+    """The number of one of so many discrete actions.
+
+    Args:
+        action: An integer without dimensions.
+        count: How many actions there are.
+
+    Raises:
+        ValueError: if it is no integer, or out of range.
+
+    >>> checked_choice(np.array(3), 4)
+    3
+    """
+    if action.shape != () or action.dtype.kind not in "iu" or not 0 <= action < count:
+        raise ValueError(f"An action is one of the integers 0 to {count - 1}; got {action.tolist()}.")
+    return int(action)
+
+
+def random_action(spec: specs.Array, random_state: np.random.RandomState) -> Any:
+    """A uniformly random action: the number of a discrete one, else [2] in [-1, 1]."""
+    if isinstance(spec, specs.DiscreteArray):
+        return random_state.randint(spec.num_values)
+    return random_state.uniform(spec.minimum, spec.maximum, size=spec.shape)

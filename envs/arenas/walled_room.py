@@ -3,10 +3,9 @@
 from typing import Any
 
 import numpy as np
-from dm_control import composer
 
+from envs.arenas.arena import WALL_GROUP, Arena
 from envs.contact import CONTACT
-from envs.props.goal_box import GoalBox
 
 _WALLS = (
     # name, direction of the outward normal, two colours: none bright, as the goals are.
@@ -16,11 +15,9 @@ _WALLS = (
     ("south", 1.5 * np.pi, (0.52, 0.47, 0.60), (0.60, 0.55, 0.68)),
 )
 _THICKNESS = 0.05
-WALL_GROUP = 1
-"""Group of the walls' geoms, by which a camera can leave them out."""
 
 
-class WalledRoom(composer.Arena):
+class WalledRoom(Arena):
     """A square floor inside four walls of different colour, under soft light without shadows.
 
     Args:
@@ -37,6 +34,8 @@ class WalledRoom(composer.Arena):
         if size <= 0 or wall_height <= 0:
             raise ValueError(f"size and wall_height must be positive; got {size} m and {wall_height} m.")
         self.size = size
+        self.half_extent = np.full(2, size / 2)
+        self.description = f"room of {size} m"
         self._build_light()
         self._build_floor()
         for wall in _WALLS:
@@ -92,7 +91,3 @@ class WalledRoom(composer.Arena):
             "camera", name="overview", pos=[0, -back, distance * np.sin(elevation)], fovy=45,
             xyaxes=[1, 0, 0, 0, np.sin(elevation), np.cos(elevation)],
         )  # fmt: skip
-
-    def attach_mocap(self, prop: GoalBox) -> None:
-        """Attaches a prop that nothing pushes and physics can move."""
-        self.attach(prop).mocap = True

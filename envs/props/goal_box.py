@@ -3,15 +3,16 @@
 from typing import Any
 
 import numpy as np
-from dm_control import composer, mjcf
+from dm_control import mjcf
 
 from envs.contact import CONTACT
+from envs.props.mocap_prop import MocapProp
 
 RED = (0.85, 0.08, 0.06, 1.0)
 GREEN = (0.05, 0.62, 0.10, 1.0)
 
 
-class GoalBox(composer.Entity):
+class GoalBox(MocapProp):
     """A coloured cube that stands on the floor and cannot be pushed: a mocap body, moved through physics only.
 
     Args:
@@ -34,32 +35,14 @@ class GoalBox(composer.Entity):
         )  # fmt: skip
 
     @property
-    def mjcf_model(self) -> mjcf.RootElement:
-        """The box's MJCF."""
-        return self._mjcf_root
-
-    @property
     def radius(self) -> float:
         """Of the circle around its footprint [m]."""
         return float(self.size / np.sqrt(2))
 
     def after_compile(self, physics: Any, random_state: np.random.RandomState) -> None:
         """Finds the box's addresses in the compiled model."""
-        del random_state
-        body = physics.model.ptr.body(self._mjcf_root.full_identifier)
-        self._mocap, self._geom = int(body.mocapid[0]), int(body.geomadr[0])
-
-    def position(self, physics: Any) -> np.ndarray:
-        """Of its centre: x, y [m], float64 [2], in the world frame."""
-        return physics.data.ptr.mocap_pos[self._mocap, :2].copy()
-
-    def set_position(self, physics: Any, position: np.ndarray, *, yaw: float = 0.0, height: float = 0.0) -> None:
-        """Moves the box to x, y [m], turned by yaw [rad], its bottom at height [m].
-
-        Positions derived from it are stale until a forward.
-        """
-        physics.data.ptr.mocap_pos[self._mocap] = *position, height
-        physics.data.ptr.mocap_quat[self._mocap] = np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)
+        super().after_compile(physics, random_state)
+        self._geom = int(physics.model.ptr.body(self._mjcf_root.full_identifier).geomadr[0])
 
     def set_solid(self, physics: Any, solid: bool) -> None:
         """Lets things collide with the box, or pass through it."""

@@ -3,20 +3,17 @@
 from typing import Any
 
 import numpy as np
-from dm_control import composer, mjcf
+from dm_control import mjcf
 from dm_env import specs
 
 from envs.contact import CONTACT
-from envs.rendering import PersistentCamera
-
-_HIDDEN = 4
-"""A geom group that cameras leave out."""
+from envs.robots.sighted_robot import HIDDEN, SightedRobot
 
 _LAG = 0.025
 """Time constant of the velocity servos [s]; above half a physics substep, or they would oscillate."""
 
 
-class Rover(composer.Entity):
+class Rover(SightedRobot):
     """A planar base (slide x, slide y, hinge yaw) with velocity servos in its own frame and an egocentric camera.
 
     Two servos drive (forward speed, turn rate); a third holds the sideways speed at zero as wheels would. The camera
@@ -59,7 +56,6 @@ class Rover(composer.Entity):
         self.reverse_speed = reverse_speed
         self.max_turn_rate = max_turn_rate
         self.image_size = image_size
-        self.camera: PersistentCamera | None = None
         self._mjcf_root = mjcf.RootElement(model=name)
         _check_speeds(reverse_speed, max_speed, max_turn_rate)
         _check_view(radius, camera_height - body_height, camera_pitch + field_of_view / 2)
@@ -77,7 +73,7 @@ class Rover(composer.Entity):
         base.add("inertial", pos=[0, 0, clearance + half], mass=mass, diaginertia=[mass * radius**2 / 2] * 3)
         self._decorate(base, "cylinder", [radius, half], [0, 0, clearance + half], [0.20, 0.23, 0.28, 1])
         # In the plane a sphere touches like the cylinder, and MuJoCo has exact contacts for it.
-        base.add("geom", name="hull", type="sphere", size=[radius], pos=[0, 0, 0.04], group=_HIDDEN, **CONTACT)
+        base.add("geom", name="hull", type="sphere", size=[radius], pos=[0, 0, 0.04], group=HIDDEN, **CONTACT)
         base.add("site", name="centre", pos=[0, 0, 0])
         for side in (-1, 1):
             self._decorate(base, "cylinder", [0.4 * radius, 0.006], [0, side * 0.95 * radius, 0.4 * radius],
@@ -87,10 +83,7 @@ class Rover(composer.Entity):
         self._base = base
 
     def _build_camera(self, height: float, pitch: float, field_of_view: float) -> None:
-        self._base.add(
-            "camera", name="egocentric", pos=[0, 0, height], fovy=np.rad2deg(field_of_view),
-            xyaxes=[0, -1, 0, np.sin(pitch), 0, np.cos(pitch)],
-        )  # fmt: skip
+        self._add_camera(self._base, [0, 0, height], pitch, field_of_view)
         # All of it behind the lens: visible to others only.
         self._decorate(self._base, "box", [0.012, 0.016, 0.012], [-0.018, 0, height], [0.85, 0.87, 0.90, 1])
         self._decorate(self._base, "cylinder", [0.005, height / 2 - 0.02], [-0.02, 0, height / 2 + 0.01],
@@ -110,11 +103,6 @@ class Rover(composer.Entity):
             self._mjcf_root.actuator.add("velocity", name=name, site="centre", gear=gear, kv=load / _LAG)
 
     @property
-    def mjcf_model(self) -> mjcf.RootElement:
-        """The robot's MJCF."""
-        return self._mjcf_root
-
-    @property
     def action_spec(self) -> specs.BoundedArray:
         """Forward speed and turn rate (positive is left), both in [-1, 1]."""
         return specs.BoundedArray((2,), np.float32, -1.0, 1.0, name="forward\tturn")
@@ -126,16 +114,7 @@ class Rover(composer.Entity):
         self._qpos = slice(joints[0].qposadr[0], joints[2].qposadr[0] + 1)
         self._qvel = slice(joints[0].dofadr[0], joints[2].dofadr[0] + 1)
         self._ctrl = slice(*_first_and_end(physics, self._mjcf_root.full_identifier))
-        self.close()
-        height, width = self.image_size
-        camera = f"{self._mjcf_root.full_identifier}egocentric"
-        self.camera = PersistentCamera(physics, camera, height=height, width=width)
-
-    def close(self) -> None:
-        """Closes the camera."""
-        if self.camera is not None:
-            self.camera.close()
-        self.camera = None
+        self._open_camera(physics)
 
     def apply_action(self, physics: Any, action: np.ndarray, random_state: np.random.RandomState) -> None:
         """Sets the servos to what :meth:`velocities` tells."""

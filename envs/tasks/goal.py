@@ -1,10 +1,10 @@
-"""Goal: a box, and when a robot has reached it."""
+"""Goal: a prop, and when a robot has reached it."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from envs.props.goal_box import GoalBox
+from envs.props.mocap_prop import MocapProp
 
 OVERSHOOT = 0.02
 """How much closer than the goal's distance a robot comes in the step that reaches it, on average over scripted
@@ -13,27 +13,33 @@ rollouts [m]."""
 
 @dataclass(frozen=True)
 class Goal:
-    """A box that is reached when the robot is close to it and has it straight ahead.
+    """A prop that is reached when the robot is close to it and has it straight ahead.
 
     Attributes:
-        box: The box.
+        box: The prop, a box or whatever else has a ``size`` and a ``radius`` [m].
         distance: Close is at most this far, between the centres of robot and box [m].
         tolerance: Straight ahead is at most this far beside the optical axis [m].
+        nearest: Closer than this the robot's camera loses it, and it is not reached [m].
+        overshoot: How much closer than ``distance`` a robot is when it has reached it, on average over scripted
+            rollouts [m].
     """
 
-    box: GoalBox
+    box: MocapProp
     distance: float
     tolerance: float
+    nearest: float = 0.0
+    overshoot: float = OVERSHOOT
 
     @property
     def offset(self) -> float:
         """How far ahead of the robot the box stands when it is reached, on average over scripted rollouts [m]."""
-        return self.distance - OVERSHOOT
+        return self.distance - self.overshoot
 
     def is_reached(self, pose: np.ndarray, position: np.ndarray) -> bool:
         """Whether a robot at pose [P] has reached the box at position [2]."""
         ahead, left = in_robot_frame(pose, position)
-        return bool(np.hypot(ahead, left) <= self.distance and ahead > 0 and abs(left) <= self.tolerance)
+        close = self.nearest <= np.hypot(ahead, left) <= self.distance
+        return bool(close and ahead > 0 and abs(left) <= self.tolerance)
 
     def check(self, robot_radius: float, *, distance_name: str, tolerance_name: str) -> None:
         """Refuses lengths with which the goal is never reached.

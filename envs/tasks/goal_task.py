@@ -8,7 +8,7 @@ import numpy as np
 from dm_control import composer
 from dm_env import specs
 
-from envs.arenas.walled_room import WalledRoom
+from envs.arenas.arena import Arena
 from envs.observables import KnownSpec
 from envs.tasks.fixed_start import read_start
 from envs.tasks.goal import Goal
@@ -58,7 +58,7 @@ class GoalTask(composer.Task):
     def __init__(
         self,
         robot: Any,
-        arena: WalledRoom,
+        arena: Arena,
         goals: Mapping[str, Goal],
         *,
         min_start_distance: float,
@@ -84,7 +84,7 @@ class GoalTask(composer.Task):
         self._energy = 0.0
 
     def _attach(self) -> None:
-        self.arena.attach(self.robot)
+        self.robot.attach_to(self.arena)
         for goal in self.goals.values():
             self.arena.attach_mocap(goal.box)
 
@@ -107,29 +107,29 @@ class GoalTask(composer.Task):
             )
         robot_range, box_range = self._robot_range, self._box_range
         widest = {
-            "min_start_distance": np.sqrt(2) * (max(robot_range, 0) + max(box_range, 0)),
-            "min_box_distance": np.sqrt(2) * 2 * max(box_range, 0),
+            "min_start_distance": np.hypot(*(np.maximum(robot_range, 0) + np.maximum(box_range, 0))),
+            "min_box_distance": np.hypot(*(2 * np.maximum(box_range, 0))),
         }
         for name, farthest in widest.items():
             distance = getattr(self, name)
-            if min(robot_range, box_range) <= 0 or not distance <= 0.75 * farthest:
+            if min(*robot_range, *box_range) <= 0 or not distance <= 0.75 * farthest:
                 raise ValueError(
-                    f"A room of {self.arena.size} m is too small for {name}={distance} m: "
-                    "use a larger room or a smaller distance."
+                    f"A {self.arena.description} is too small for {name}={distance} m: "
+                    "use a larger one or a smaller distance."
                 )
 
     @property
-    def _robot_range(self) -> float:
+    def _robot_range(self) -> np.ndarray:
         # Largest |x| and |y| of the robot at the start.
-        return self.arena.size / 2 - self.robot.radius - _WALL_CLEARANCE
+        return self.arena.half_extent - self.robot.radius - _WALL_CLEARANCE
 
     @property
-    def _box_range(self) -> float:
+    def _box_range(self) -> np.ndarray:
         # Far enough from the walls that the robot can stand before any side of it.
-        return self.arena.size / 2 - max(goal.distance for goal in self.goals.values()) - self.robot.radius
+        return self.arena.half_extent - max(goal.distance for goal in self.goals.values()) - self.robot.radius
 
     @property
-    def root_entity(self) -> WalledRoom:
+    def root_entity(self) -> Arena:
         """The arena."""
         return self.arena
 
@@ -141,13 +141,13 @@ class GoalTask(composer.Task):
     @property
     def pose_spec(self) -> specs.BoundedArray:
         """Of ``pose``, float32 [P]: within the room, and within (-pi, pi], and flags in [0, 1]."""
-        half = self.arena.size / 2
-        lowest = np.array([-half, -half, -np.pi, *(0.0 for _ in self.flags)], np.float32)
-        highest = np.array([half, half, np.pi, *(1.0 for _ in self.flags)], np.float32)
+        half = self.arena.half_extent
+        lowest = np.array([*-half, -np.pi, *(0.0 for _ in self.flags)], np.float32)
+        highest = np.array([*half, np.pi, *(1.0 for _ in self.flags)], np.float32)
         return specs.BoundedArray(lowest.shape, np.float32, lowest, highest, name="pose")
 
     def action_spec(self, physics: Any) -> Any:
-        """Forward speed and turn rate in [-1, 1]."""
+        """That of the robot."""
         del physics
         return self.robot.action_spec
 
@@ -226,11 +226,11 @@ class GoalTask(composer.Task):
                 raise ValueError(f"{flag}={fixed[flag].item():g} must be 0 or 1.")
 
     def _check_in_room(self, name: str, fixed: Mapping[str, np.ndarray], extent: float) -> None:
-        limit = self.arena.size / 2 - extent
-        if name in fixed and np.abs(fixed[name][:2]).max() > limit:
+        x, y = self.arena.half_extent - extent
+        if name in fixed and (np.abs(fixed[name][:2]) > (x, y)).any():
             raise ValueError(
-                f"{name}={fixed[name].tolist()} is not inside the room of {self.arena.size} m: "
-                f"choose x and y in [-{limit:g}, {limit:g}] m."
+                f"{name}={fixed[name].tolist()} is not inside the {self.arena.description}: "
+                f"choose x in [-{x:g}, {x:g}] and y in [-{y:g}, {y:g}] m."
             )
 
     def _check_robot_apart(self, name: str, fixed: Mapping[str, np.ndarray]) -> None:
@@ -281,7 +281,7 @@ class GoalTask(composer.Task):
                 return start | {"pose": np.array([*start["pose"], yaw])}
         raise composer.EpisodeInitializationError(
             f"No start with robot and box {self.min_start_distance} m apart, and boxes {self.min_box_distance} m from "
-            f"each other, in {_MAX_DRAWS} draws: use a larger room or smaller distances."
+            f"each other, in {_MAX_DRAWS} draws: use a larger place or smaller distances."
         )
 
     def _far_apart(self, start: Mapping[str, np.ndarray], fixed: Mapping[str, np.ndarray]) -> bool:

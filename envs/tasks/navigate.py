@@ -1,21 +1,17 @@
 """Navigate: find the box, drive up to it, and centre it in the image."""
 
-from typing import Any
-
-import numpy as np
-
 from envs.arenas.walled_room import WalledRoom
 from envs.props.goal_box import GoalBox
 from envs.robots.rover import Rover
 from envs.tasks.goal import OVERSHOOT, Goal
-from envs.tasks.goal_task import GoalTask
+from envs.tasks.single_goal import SingleGoalTask
 
 _SUCCESS_DISTANCE = 0.16
 GOAL_OFFSET = _SUCCESS_DISTANCE - OVERSHOOT
 """How far ahead of the robot the box stands when an episode of the named environments succeeds, on average [m]."""
 
 
-class Navigate(GoalTask):
+class Navigate(SingleGoalTask):
     """Reward 1 and the end when the robot stands close to the box with the box ahead of it; a small cost of moving.
 
     Close: at most ``success_distance`` between the centres of robot and box. The default is the radius of the box's
@@ -48,16 +44,5 @@ class Navigate(GoalTask):
         centring_tolerance: float = 0.01,
         **kwargs: float,
     ) -> None:
-        self._goal = Goal(goal_box, success_distance, centring_tolerance)
-        self._goal.check(robot.radius, distance_name="success_distance", tolerance_name="centring_tolerance")
-        super().__init__(robot, arena, {"box": self._goal}, min_start_distance=min_start_distance, **kwargs)
-
-    def goal(self, pose: np.ndarray) -> Goal:
-        """The box, wherever the robot is."""
-        del pose
-        return self._goal
-
-    def after_step(self, physics: Any, random_state: np.random.RandomState) -> None:
-        """Notes whether the goal is reached."""
-        del random_state
-        self._succeeded = self.is_success(self.pose(physics), self.goal_position(physics))
+        goal = Goal(goal_box, success_distance, centring_tolerance)
+        super().__init__(robot, arena, "box", goal, min_start_distance=min_start_distance, **kwargs)

@@ -9,8 +9,10 @@ import pytest
 from matplotlib import pyplot as plt
 from matplotlib.backend_bases import KeyEvent
 
+import envs
 from envs import drive
 from envs.robots.rover import Rover
+from envs.robots.turtlebot import BACKWARD, FORWARD, LEFT, RIGHT, TurtleBot
 
 
 def held(*names):
@@ -35,6 +37,26 @@ def held(*names):
 def test_the_arrows_that_are_held_say_where_to_drive(names, speed, turn_rate):
     rover = Rover(reverse_speed=0.2)
     assert rover.velocities(held(*names).action(rover)) == pytest.approx((speed, turn_rate))
+
+
+@pytest.mark.parametrize(
+    ("names", "motion"), [(("up",), FORWARD), (("down",), BACKWARD), (("left",), LEFT), (("right",), RIGHT)]
+)
+def test_the_arrows_choose_among_discrete_actions(names, motion):
+    assert held(*names).action(TurtleBot()) == motion
+
+
+def test_a_robot_that_cannot_stand_still_waits_for_a_key():
+    assert held().action(TurtleBot()) is None
+    environment = envs.find_pebble(random_state=0)
+    cockpit = drive.Cockpit(environment)
+    cockpit.tick()
+    first = environment.task.robot.pose(environment.physics)
+    cockpit.tick()
+    np.testing.assert_array_equal(environment.task.robot.pose(environment.physics), first)
+    assert len(shown(cockpit)) == 2
+    plt.close(cockpit.figure)
+    environment.close()
 
 
 def test_a_robot_without_reverse_gear_stands_still_on_down():

@@ -3,7 +3,6 @@ import warnings
 import gymnasium
 import numpy as np
 import pytest
-import torch
 from gymnasium.utils.env_checker import check_env
 from tensordict import TensorDict
 
@@ -39,6 +38,7 @@ def test_every_name_has_an_id_by_one_rule():
     assert IDS == {
         "navigate-2m": "halgan_rl/Navigate2m-v0",
         "navigate-4m": "halgan_rl/Navigate4m-v0",
+        "pebble": "halgan_rl/Pebble-v0",
         "pick-and-place-2m": "halgan_rl/PickAndPlace2m-v0",
     }
     registered = {id_ for id_ in gymnasium.registry if id_.startswith("halgan_rl/")}
@@ -58,18 +58,20 @@ def test_spaces_are_those_of_the_data_contract(name):
     pixels, pose = env.observation_space["pixels"], env.observation_space["pose"]
     assert (pixels.shape, pixels.dtype, pixels.low.min(), pixels.high.max()) == ((64, 64, 3), np.uint8, 0, 255)
     task = env.unwrapped.environment.task
-    half, flags = task.arena.size / 2, [1.0] * len(task.flags)
-    assert (pose.dtype, pose.high.tolist()) == (np.float32, pytest.approx([half, half, np.pi, *flags]))
-    assert pose.low.tolist() == pytest.approx([-half, -half, -np.pi, *(0 * flag for flag in flags)])
-    assert env.action_space == gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
-    assert env.metadata["render_fps"] == 10
+    half, flags = task.arena.half_extent, [1.0] * len(task.flags)
+    assert (pose.dtype, pose.high.tolist()) == (np.float32, pytest.approx([*half, np.pi, *flags]))
+    assert pose.low.tolist() == pytest.approx([*-half, -np.pi, *(0 * flag for flag in flags)])
+    two_speeds = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+    assert env.action_space == (gymnasium.spaces.Discrete(4) if name == "pebble" else two_speeds)
+    assert env.metadata["render_fps"] == (4 if name == "pebble" else 10)
     env.close()
 
 
 @pytest.mark.parametrize("name", sorted(envs.NAMES))
 def test_equal_seeds_give_equal_episodes_and_those_of_the_torchrl_face(name):
-    actions = np.random.RandomState(0).uniform(-1, 1, size=(12, 2)).astype(np.float32)
     env, twin = gymnasium.make(IDS[name]), envs.make(name, seed=7)
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(12)]
     episodes = [gymnasium_episode(env, seed, actions) for seed in (7, 7, 8)]
     expected = torchrl_episode(twin, actions)
     env.close()
@@ -92,7 +94,8 @@ def gymnasium_episode(env, seed, actions):
 
 def torchrl_episode(env, actions):
     start = env.reset()
-    steps = [env.step(TensorDict({"action": torch.from_numpy(action)}, []))["next"] for action in actions]
+    encoded = [env.action_spec.encode(action) for action in actions]
+    steps = [env.step(TensorDict({"action": action}, []))["next"] for action in encoded]
     observations = [start, *steps]
     return (
         [o["pixels"].numpy() for o in observations],
@@ -188,6 +191,15 @@ def test_impossible_options_are_refused_and_the_episode_goes_on(env, options, me
     np.testing.assert_allclose(env.step(BRAKE)[0]["pose"], [0.1, -0.2, 0.7], atol=1e-3)
     env.reset()
     assert abs(box_of(env) - [0.5, 0.3]).max() > 1e-3
+
+
+@pytest.mark.parametrize("action", [4, -1, 1.0, [0], [1, 0, 0, 0]])
+def test_numbers_of_no_discrete_action_are_refused(action):
+    env = gymnasium.make(IDS["pebble"])
+    env.reset()
+    with pytest.raises(ValueError, match="one of the integers 0 to 3; got"):
+        env.unwrapped.step(action)
+    env.close()
 
 
 @pytest.mark.parametrize(

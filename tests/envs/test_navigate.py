@@ -8,6 +8,7 @@ from envs.arenas.walled_room import WalledRoom
 from envs.props.goal_box import GoalBox
 from envs.robots.rover import Rover
 from envs.tasks.navigate import Navigate
+from envs.transition import random_action
 
 
 def make_task(size=2.0, **arguments):
@@ -57,22 +58,24 @@ def test_the_time_limit_truncates_after_200_steps(stage):
 
 def test_starts_are_far_apart_free_and_reachable(named_environment):
     task, random_state = named_environment.task, np.random.RandomState(0)
-    half, nearest = task.arena.size / 2, {2.0: 0.5, 4.0: 1.0}[task.arena.size]
+    half, nearest = task.arena.half_extent, {1.0: 0.5, 2.0: 1.0, 3.0: 0.6}[task.arena.half_extent[0]]
     for _ in range(2000):
         start = task.draw_start(random_state)
         pose = start["pose"]
-        assert np.abs(pose[:2]).max() <= half - task.robot.radius
+        assert (np.abs(pose[:2]) <= half - task.robot.radius).all()
         assert -np.pi <= pose[2] <= np.pi
         for name, goal in task.goals.items():
             assert np.hypot(*(pose[:2] - start[name])) >= nearest
             # Room for the robot between box and wall.
-            assert np.abs(start[name]).max() <= half - goal.box.radius - 2 * task.robot.radius
+            assert (np.abs(start[name]) <= half - goal.box.radius - 2 * task.robot.radius).all()
 
 
-def test_episodes_start_without_contact(named_environment):
+def test_episodes_start_without_contact_but_for_wheels_on_the_ground(named_environment):
     for _ in range(30):
         named_environment.reset()
-        assert named_environment.physics.data.ncon == 0
+        model, data = named_environment.physics.model, named_environment.physics.data
+        touched = [model.id2name(contact.geom1, "geom") for contact in data.contact]
+        assert set(touched) <= {"asphalt"}
 
 
 def test_every_named_environment_keeps_its_spec(named_environment):
@@ -86,7 +89,7 @@ def test_every_named_environment_keeps_its_spec(named_environment):
     for _ in range(20):
         for name, value in timestep.observation.items():
             spec[name].validate(value)
-        timestep = named_environment.step(random_state.uniform(-1, 1, size=2))
+        timestep = named_environment.step(random_action(named_environment.action_spec(), random_state))
         assert -0.0025 * np.sqrt(2) <= timestep.reward <= 1.0
 
 
@@ -95,12 +98,13 @@ def test_the_rooms_have_the_paper_s_size_and_the_small_one():
     for name, build in envs.NAMES.items():
         environment = build(random_state=0)
         task = environment.task
-        sizes[name] = (task.arena.size, *(goal.tolerance for goal in task.goals.values()))
+        sizes[name] = (*2 * task.arena.half_extent, *(goal.tolerance for goal in task.goals.values()))
         environment.close()
     assert sizes == {
-        "navigate-4m": (4.0, 0.01),
-        "navigate-2m": (2.0, 0.02),
-        "pick-and-place-2m": (2.0, 0.02, 0.02),
+        "navigate-4m": (4.0, 4.0, 0.01),
+        "navigate-2m": (2.0, 2.0, 0.02),
+        "pebble": (6.0, 3.0, 0.05),
+        "pick-and-place-2m": (2.0, 2.0, 0.02, 0.02),
     }
 
 

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.envs import ParallelEnv
 from torchrl.envs.utils import check_env_specs
+from torchrl.modules import EGreedyModule, QValueActor
 
 import envs
 
@@ -14,6 +16,13 @@ import envs
 @pytest.fixture(scope="module")
 def env():
     env = envs.make("navigate-2m", seed=0)
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def pebble_env():
+    env = envs.make("pebble", seed=0)
     yield env
     env.close()
 
@@ -92,6 +101,33 @@ def test_bad_actions_are_refused(env, action):
     env.reset()
     with pytest.raises(ValueError, match=r"must lie in \[-1, 1\]; got"):
         env.step(act(*action))
+
+
+@pytest.mark.parametrize("action", [(1, 1, 0, 0), (0, 0, 0, 0), (0, 2, 0, 0), (0, 2, -1, 0)])
+def test_discrete_actions_that_are_not_one_hot_are_refused(pebble_env, action):
+    pebble_env.reset()
+    with pytest.raises(ValueError, match=r"one-hot.*got"):
+        pebble_env.step(TensorDict({"action": torch.tensor(action)}, []))
+
+
+@pytest.mark.parametrize(("motion", "moved"), [(0, 0.1), (3, -0.1)])
+def test_the_place_of_the_one_tells_the_motion(pebble_env, motion, moved):
+    action = TensorDict({"action": torch.eye(4, dtype=torch.int64)[motion]}, [])
+    pebble_env.environment.reset_to({"pose": (0.0, 0.3, 0.0), "pebble": (2.0, -0.5)})
+    pebble_env.step(action)
+    before = pebble_env.step(action)["next", "pose"]
+    after = pebble_env.step(action)["next", "pose"]
+    assert (after - before)[0].item() == pytest.approx(moved, abs=1e-3)
+
+
+def test_torchrl_s_q_actors_act_in_it(pebble_env):
+    network = torch.nn.Sequential(torch.nn.Flatten(-3), torch.nn.Linear(64 * 64 * 3, 4))
+    scaled = TensorDictModule(lambda pixels: pixels / 255.0, in_keys=["pixels"], out_keys=["scaled"])
+    greedy = QValueActor(network, in_keys=["scaled"], spec=pebble_env.action_spec)
+    policy = TensorDictSequential(scaled, greedy, EGreedyModule(pebble_env.action_spec, annealing_num_steps=2))
+    out = pebble_env.rollout(6, policy)
+    assert out["action"].shape == (6, 4)
+    assert (out["action"].sum(-1) == 1).all()
 
 
 def test_rounding_overshoot_is_clipped(env):

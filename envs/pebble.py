@@ -1,0 +1,29 @@
+"""The named environment of the pebble task: a plain function that puts robot, road and task together."""
+
+import numpy as np
+
+from envs.arenas.road import Road
+from envs.environment import Environment
+from envs.props.pebble import Pebble
+from envs.robots.turtlebot import TurtleBot
+from envs.tasks.pebble import FindPebble
+
+
+def find_pebble(random_state: int | np.random.RandomState | None = None, time_limit: float = 25.0) -> Environment:
+    """The paper's TurtleBot task (Sahni et al., NeurIPS 2019): find the pebble on a road; four discrete actions.
+
+    Args:
+        random_state: Seed or generator of the starts.
+        time_limit: Seconds an episode; a step takes 0.25 s.
+    """
+    # The robot, and what it must find.
+    robot = TurtleBot()
+    pebble = Pebble()
+
+    # A road full of other things to look at.
+    arena = Road()
+
+    # A task that rewards success only.
+    task = FindPebble(robot, arena, pebble)
+
+    return Environment(task, time_limit=time_limit, random_state=random_state)

@@ -1,0 +1,42 @@
+"""SingleGoalTask: what tasks share in which there is one thing to find."""
+
+from typing import Any
+
+import numpy as np
+
+from envs.arenas.arena import Arena
+from envs.tasks.goal import Goal
+from envs.tasks.goal_task import GoalTask
+
+
+class SingleGoalTask(GoalTask):
+    """Reward 1 and the end when the only goal is reached.
+
+    Args:
+        robot: The robot.
+        arena: The place; robot and goal are attached to it.
+        name: Under which starts know the goal.
+        goal: The goal.
+        min_start_distance: Between robot and goal at the start of an episode [m].
+        kwargs: Costs, rewards and timesteps, see :class:`GoalTask`.
+
+    Raises:
+        ValueError: if a length is not positive, or the arena is too small for the start distance.
+    """
+
+    def __init__(
+        self, robot: Any, arena: Arena, name: str, goal: Goal, *, min_start_distance: float, **kwargs: float
+    ) -> None:
+        self._goal = goal
+        goal.check(robot.radius, distance_name="success_distance", tolerance_name="centring_tolerance")
+        super().__init__(robot, arena, {name: goal}, min_start_distance=min_start_distance, **kwargs)
+
+    def goal(self, pose: np.ndarray) -> Goal:
+        """The only one, wherever the robot is."""
+        del pose
+        return self._goal
+
+    def after_step(self, physics: Any, random_state: np.random.RandomState) -> None:
+        """Notes whether the goal is reached."""
+        del random_state
+        self._succeeded = self.is_success(self.pose(physics), self.goal_position(physics))
