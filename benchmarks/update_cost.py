@@ -18,20 +18,13 @@ from typing import Any
 import torch
 import tyro
 from tensordict import TensorDict
+from torchrl.data import Bounded
 
 import envs
 from benchmarks.rounds import alternate, seconds_a_call, warm_heap
 from benchmarks.tables import Table, report
-from recipes.ddpg_navigate import (
-    Config,
-    make_agent,
-    make_buffer,
-    make_hallucinator,
-    make_hindsight,
-    make_loss,
-    make_optimizer,
-    update,
-)
+from halgan_rl.experiment import make_buffer, make_hallucinator, make_hindsight
+from recipes.ddpg_navigate import Config, make_agent
 
 PAINTERS: dict[str, dict[str, Any]] = {
     "bank": {"bank": True},
@@ -56,11 +49,10 @@ class Benchmark:
 def make_update(config: Config, rollout: TensorDict) -> Callable[[], object]:
     """Return one update of the recipe on a buffer of its own."""
     config = dataclasses.replace(config, replay_capacity=len(rollout))
-    buffer = make_buffer(config, make_hindsight(config, make_hallucinator(config)))
+    buffer = make_buffer(config, make_hindsight(config, make_hallucinator(config, envs)))
     buffer.extend(rollout.clone())
-    loss, updater = make_loss(config, *make_agent(config, action_size=2))
-    optimizer = make_optimizer(config, loss)
-    return lambda: update(buffer.sample(), loss, optimizer, updater)
+    agent = make_agent(config, Bounded(-1.0, 1.0, (2,)))
+    return lambda: agent.update(buffer.sample())
 
 
 def main(benchmark: Benchmark) -> None:

@@ -23,15 +23,16 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl import logger as torchrl_logger
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import Bounded, LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
 
 from benchmarks import sb3_peers
 from benchmarks.rounds import alternate, seconds_a_call, warm_heap
 from benchmarks.rows import Rows, channels_first, plain
 from benchmarks.tables import Table, report
+from halgan_rl.experiment import make_buffer
 from halgan_rl.models.agents import Actor, Critic, Downsample
-from recipes.ddpg_navigate import Config, make_agent, make_buffer, make_loss, make_optimizer, update
+from recipes.ddpg_navigate import Config, make_agent
 
 Update = Callable[[], object]
 Counts = tuple[int, ...]
@@ -58,10 +59,8 @@ def ours(config: Config, rows: TensorDict) -> tuple[Update, Counts]:
     """Return the recipe's update, and the numbers of parameters."""
     buffer = make_buffer(config, None)
     buffer.extend(plain(rows))
-    actor, critic = make_agent(config, action_size=2)
-    loss, target_updater = make_loss(config, actor, critic)
-    optimizer = make_optimizer(config, loss)
-    return lambda: update(buffer.sample(), loss, optimizer, target_updater), count_parameters(actor, critic)
+    agent = make_agent(config, Bounded(-1.0, 1.0, (2,)))
+    return lambda: agent.update(buffer.sample()), count_parameters(agent.network, agent.loss.value_network)
 
 
 class ContiguousActor(Actor):

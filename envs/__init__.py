@@ -15,7 +15,7 @@ from envs import gl_backend  # First: it settles the OpenGL backend, which mujoc
 from envs.environment import Environment
 from envs.golden import fingerprint
 from envs.gymnasium_env import GymnasiumEnv, gymnasium_id, register_named
-from envs.names import NAMES, goal_offsets, named
+from envs.names import NAMES, goal_offsets, named, pose_flags
 from envs.navigate import navigate_2m, navigate_4m
 from envs.near_goal import collect_failed, collect_near_goal
 from envs.oracle import GoalRenderer
@@ -33,14 +33,15 @@ __all__ = [
     "collect_near_goal",
     "find_pebble",
     "fingerprint",
-    "goal_offsets",
     "gl_backend",
+    "goal_offsets",
     "gymnasium_id",
     "make",
     "named",
     "navigate_2m",
     "navigate_4m",
     "pick_and_place_2m",
+    "pose_flags",
 ]
 
 register_named()

@@ -1,6 +1,7 @@
 """The named environments."""
 
 from collections.abc import Callable
+from contextlib import closing
 
 from envs.environment import Environment
 from envs.navigate import navigate_2m, navigate_4m
@@ -25,11 +26,21 @@ def goal_offsets(name: str) -> tuple[float, ...]:
     Raises:
         ValueError: if the name is unknown.
     """
-    environment = named(name)()
-    try:
+    with closing(named(name)()) as environment:
         return environment.task.goal_offsets
-    finally:
-        environment.close()
+
+
+def pose_flags(name: str) -> tuple[str, ...]:
+    """The names of the entries of a pose after x, y and yaw, each 0 or 1.
+
+    >>> pose_flags("pick-and-place-2m")
+    ('held',)
+
+    Raises:
+        ValueError: if the name is unknown.
+    """
+    with closing(named(name)()) as environment:
+        return environment.task.flags
 
 
 def named(name: str) -> Callable[..., Environment]:

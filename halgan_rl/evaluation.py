@@ -1,7 +1,7 @@
 """Evaluation of a policy on fixed starts."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -19,11 +19,13 @@ class Evaluation:
         success_rate: share of the episodes that *terminated*, in [0, 1]; running out of time is no success.
         episode_return: mean undiscounted sum of rewards.
         episode_length: mean number of steps.
+        flags: by the name of each of the pose's flags, share of the episodes that ended with it set.
     """
 
     success_rate: float
     episode_return: float
     episode_length: float
+    flags: Mapping[str, float] = field(default_factory=dict)
 
     def metrics(self, prefix: str = "eval") -> dict[str, float]:
         """Return the figures under ``prefix/``, ready for a logger."""
@@ -31,11 +33,20 @@ class Evaluation:
             f"{prefix}/success_rate": self.success_rate,
             f"{prefix}/return": self.episode_return,
             f"{prefix}/episode_length": self.episode_length,
+            **{f"{prefix}/{flag}": share for flag, share in self.flags.items()},
         }
 
 
 @torch.no_grad()
-def evaluate(env: EnvBase, policy: TensorDictModuleBase, *, seeds: Sequence[int], max_steps: int = 1_000) -> Evaluation:
+def evaluate(
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    *,
+    seeds: Sequence[int],
+    max_steps: int = 1_000,
+    flags: Sequence[str] = (),
+    pose_key: NestedKey = "pose",
+) -> Evaluation:
     """Run the deterministic policy once from each start.
 
     Args:
@@ -43,13 +54,15 @@ def evaluate(env: EnvBase, policy: TensorDictModuleBase, *, seeds: Sequence[int]
         policy: reads the environment's observations and writes ``action``.
         seeds: one seed a start; the same seeds are the same starts.
         max_steps: bound on an episode's length, if the environment does not end it before.
+        flags: names of the pose's flags, its entries after the third: how often they are set in the end is reported.
+        pose_key: where the environment writes the pose.
 
     Raises:
         ValueError: if ``seeds`` is empty.
     """
     if not seeds:
         raise ValueError("seeds is empty: give one seed for each start to evaluate")
-    successes, returns, lengths = [], [], []
+    successes, returns, lengths, last_flags = [], [], [], []
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         for seed in seeds:
             env.set_seed(seed)
@@ -57,8 +70,11 @@ def evaluate(env: EnvBase, policy: TensorDictModuleBase, *, seeds: Sequence[int]
             successes.append(float(episode["next", "terminated"][-1]))
             returns.append(float(episode["next", "reward"].sum()))
             lengths.append(len(episode))
+            if flags:
+                last_flags.append(episode["next"].get(pose_key)[-1, 3:])
     n = len(seeds)
-    return Evaluation(sum(successes) / n, sum(returns) / n, sum(lengths) / n)
+    shares = dict(zip(flags, torch.stack(last_flags).mean(0).tolist(), strict=True)) if flags else {}
+    return Evaluation(sum(successes) / n, sum(returns) / n, sum(lengths) / n, shares)
 
 
 @torch.no_grad()

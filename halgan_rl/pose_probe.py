@@ -26,13 +26,13 @@ class PoseProbe(nn.Module):
         return torch.stack([bearing, log_distance.exp()], -1)
 
 
-def polar_goal(pose: Tensor, goal_pose: Tensor, *, goal_offset: float) -> Tensor:
+def polar_goal(pose: Tensor, goal_pose: Tensor, *, goal_offset: float | Tensor) -> Tensor:
     """Return bearing [rad] and distance [m] of goals as seen from poses, ``[..., 2]``.
 
     Args:
         pose: ``[..., P]``.
         goal_pose: ``[..., P]``, from where the goal is reached.
-        goal_offset: the goal stands this far ahead of its goal pose [m].
+        goal_offset: the goals stand this far ahead of their goal poses [m], broadcasts against ``[...]``.
     """
     x, y, yaw = relative_pose(pose, goal_pose).unbind(-1)
     x, y = x + goal_offset * yaw.cos(), y + goal_offset * yaw.sin()

@@ -26,7 +26,7 @@ class RunFolder:
         check_unused(path)
         path.mkdir(parents=True, exist_ok=True)
         self.path = path
-        self._columns = columns
+        self.columns = columns
         with self.file("metrics.csv").open("w", newline="") as file:
             csv.writer(file).writerow(columns)
 
@@ -48,7 +48,7 @@ class RunFolder:
             KeyError: if a column is missing from the row.
         """
         with self.file("metrics.csv").open("a", newline="") as file:
-            csv.writer(file).writerow([f"{row[column]:.6g}" for column in self._columns])
+            csv.writer(file).writerow([f"{row[column]:.6g}" for column in self.columns])
 
 
 def check_unused(path: Path) -> None:

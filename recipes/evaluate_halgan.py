@@ -35,6 +35,7 @@ from halgan_rl import fidelity, pictures
 from halgan_rl.hallucination_bank import BankGrid, HallucinationBank
 from halgan_rl.hallucinators import GanHallucinator, Hallucinator
 from halgan_rl.pose_probe import PoseProbe, polar_goal, train_probe
+from halgan_rl.poses import flag_number
 from halgan_rl.run_folder import check_unused, versions, write_json
 from halgan_rl.weights import load_generator, read_manifest, shipped_weights
 
@@ -76,7 +77,8 @@ def main(config: Config) -> None:
     """Collect, paint, compare, and write the report."""
     check_unused(config.out)
     path = config.weights or shipped_weights(config.environment)
-    generator = load_generator(path, expected=envs.fingerprint(config.environment))
+    expected, pose_size = envs.fingerprint(config.environment), 3 + len(envs.pose_flags(config.environment))
+    generator = load_generator(path, expected=expected, pose_size=pose_size)
     rng = torch.Generator().manual_seed(config.seed)
     torch.manual_seed(config.seed)
     hallucinator: Hallucinator = GanHallucinator(generator, rng=rng, share_latent=config.share_latent)
@@ -191,7 +193,13 @@ def near_goal(config: Config, count: int, seed: int) -> dict[str, Tensor]:
     environment = envs.named(config.environment)(random_state=seed)
     data = envs.collect_near_goal(environment, count, np.random.RandomState(seed))
     environment.close()
-    return {name: torch.from_numpy(array) for name, array in data.items()}
+    return with_offsets(config, {name: torch.from_numpy(array) for name, array in data.items()})
+
+
+def with_offsets(config: Config, data: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Add how far ahead of its goal pose each row's goal stands."""
+    offsets = torch.tensor(envs.goal_offsets(config.environment))
+    return data | {"goal_offset": offsets[flag_number(data["pose"])]}
 
 
 def draw_failures(config: Config, renderer: envs.GoalRenderer, rng: torch.Generator) -> dict[str, Tensor]:
@@ -206,7 +214,7 @@ def draw_failures(config: Config, renderer: envs.GoalRenderer, rng: torch.Genera
     start = torch.randint(len(pose), (40 * config.frames,), generator=rng)
     ahead = (start + 1 + (torch.rand(len(start), generator=rng).square() * 96).long()).clamp(max=len(pose) - 1)
     good = (walk[start] == walk[ahead]) & (ahead > start)
-    data = {"pose": pose[start[good]], "goal_pose": pose[ahead[good]]}
+    data = with_offsets(config, {"pose": pose[start[good]], "goal_pose": pose[ahead[good]]})
     return without_goal({name: entry[: config.frames] for name, entry in data.items()}, renderer)
 
 
@@ -225,7 +233,7 @@ def in_view(data: dict[str, Tensor]) -> dict[str, Tensor]:
 
 def polar(data: dict[str, Tensor]) -> Tensor:
     """Return bearing and distance of the goals, ``[N, 2]``."""
-    return polar_goal(data["pose"], data["goal_pose"], goal_offset=envs.GOAL_OFFSET)
+    return polar_goal(data["pose"], data["goal_pose"], goal_offset=data["goal_offset"])
 
 
 def paint(painter: Hallucinator, data: dict[str, Tensor]) -> Tensor:

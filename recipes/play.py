@@ -16,9 +16,11 @@ import tyro
 import envs
 from halgan_rl import pictures
 from halgan_rl.evaluation import evaluate, record
-from halgan_rl.models.agents import Actor, deterministic_policy
-from halgan_rl.weights import load_module
+from halgan_rl.models.agents import Actor, QNetwork, deterministic_policy, greedy_policy
+from halgan_rl.weights import load_module, read_manifest
 
+POLICIES = {Actor.kind: (Actor, deterministic_policy), QNetwork.kind: (QNetwork, greedy_policy)}
+"""Kind of a saved network: how it is rebuilt, and how it acts."""
 FIRST_SEED = 20_000
 """Seed of the first start; the starts of training's own evaluations lie below."""
 
@@ -41,8 +43,9 @@ def main(config: Config) -> None:
     """Evaluate the policy of a run, and film it if asked to."""
     torch.set_num_threads(1)  # as in training: more do not help networks this small
     path = config.run / "policy.safetensors"
-    network, manifest = load_module(path, Actor)
-    policy = deterministic_policy(network)
+    build, make_policy = POLICIES[read_manifest(path)["kind"]]
+    network, manifest = load_module(path, build)
+    policy = make_policy(network)
     env = envs.make(manifest["environment"])
     seeds = range(config.first_seed, config.first_seed + config.starts)
     result = evaluate(env, policy, seeds=seeds)

@@ -6,6 +6,7 @@ import torch
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
+from torchrl.modules import QValueActor
 
 from halgan_rl.models.halgan import LEAK
 from halgan_rl.models.pixels import to_float
@@ -65,6 +66,10 @@ class Actor(nn.Module):
         small_output: start the last layer's weights and biases within 3e-3 of zero, as DDPG does: an untrained policy
             then asks for the middle of all actions, whatever it sees.
 
+    Attributes:
+        kind: what manifests call such networks.
+        arguments: what rebuilds the network, ready for JSON.
+
     Examples:
         >>> from tensordict import TensorDict
         >>> images = torch.zeros(5, 64, 64, 3, dtype=torch.uint8)
@@ -72,9 +77,11 @@ class Actor(nn.Module):
         torch.Size([5, 2])
     """
 
+    kind = "actor"
+
     def __init__(self, action_size: int = 2, *, downsample: Downsample = "stride", small_output: bool = True) -> None:
         super().__init__()
-        self.action_size = action_size
+        self.arguments = {"action_size": action_size, "downsample": downsample}
         self.vision = Vision(downsample)
         self.head = _head(_VISION_SIZE, action_size)
         if small_output:
@@ -132,16 +139,39 @@ class QNetwork(nn.Module):
     Args:
         actions: number of discrete actions A.
         downsample: see :class:`Vision`.
+
+    Attributes:
+        kind: what manifests call such networks.
+        arguments: what rebuilds the network, ready for JSON.
     """
+
+    kind = "q_network"
 
     def __init__(self, actions: int = 4, *, downsample: Downsample = "stride") -> None:
         super().__init__()
+        self.arguments = {"actions": actions, "downsample": downsample}
         self.vision = Vision(downsample)
         self.head = _head(_VISION_SIZE, actions)
 
     def forward(self, pixels: Tensor) -> Tensor:
         """Return values ``[..., A]`` for images uint8 ``[..., 64, 64, 3]``."""
         return self.head(self.vision(pixels)).reshape(*pixels.shape[:-3], -1)
+
+
+def greedy_policy(network: QNetwork, *, pixels_key: NestedKey = "pixels") -> QValueActor:
+    """Return the policy of an action-value network: reads images, writes the best action, one-hot, and all values.
+
+    Args:
+        network: the network.
+        pixels_key: images uint8 ``[..., 64, 64, 3]``.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> images = torch.zeros(5, 64, 64, 3, dtype=torch.uint8)
+        >>> greedy_policy(QNetwork())(TensorDict({"pixels": images}, batch_size=[5]))["action"].shape
+        torch.Size([5, 4])
+    """
+    return QValueActor(network, in_keys=[pixels_key], action_space="one_hot")
 
 
 def _head(inputs: int, outputs: int) -> nn.Sequential:

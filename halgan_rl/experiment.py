@@ -1,0 +1,317 @@
+"""An agent trained with hindsight, from its configuration to its pictures: what the recipes for agents share.
+
+Knows no simulator: the recipes pass one, see :class:`Simulator`.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Literal, Protocol, TypeVar
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+from torchrl.collectors import Collector
+from torchrl.data import TensorDictReplayBuffer, TensorSpec
+from torchrl.envs import Compose, EnvBase
+from torchrl.record.loggers import Logger
+from torchrl.record.loggers.tensorboard import TensorboardLogger
+
+from halgan_rl import pictures, pipelines
+from halgan_rl.evaluation import evaluate, record
+from halgan_rl.frame_storage import FrameStorage
+from halgan_rl.hallucination_bank import BankGrid, HallucinationBank
+from halgan_rl.hallucinators import GanHallucinator, Hallucinator
+from halgan_rl.poses import PoseTolerance
+from halgan_rl.run_folder import RunFolder, check_unused, read_metrics, versions
+from halgan_rl.training import COLUMNS, Agent, Schedule, train
+from halgan_rl.weights import load_generator, save_weights, shipped_weights
+
+
+class Simulator(Protocol):
+    """What is asked of a simulator, such as the package ``envs``. Environments go by names."""
+
+    def make(self, name: str, *, seed: int | None = None) -> EnvBase:
+        """Make an environment with ``pixels`` and ``pose``, and ``render_overview(height, width)`` for people."""
+
+    def fingerprint(self, name: str) -> Mapping[str, str]:
+        """Return what its images depend on, see :func:`halgan_rl.weights.load_generator`."""
+
+    def pose_flags(self, name: str) -> Sequence[str]:
+        """Return the names of the entries of its poses after x, y and yaw."""
+
+    def goal_offsets(self, name: str) -> tuple[float, ...]:
+        """Return how far ahead of a goal pose the goal stands [m], for each setting of the flags."""
+
+    def GoalRenderer(self, name: str) -> Hallucinator:
+        """Return an oracle: what paints the goal as the simulator shows it."""
+
+
+EVALUATION_SEED = 10_000
+"""Seed of the first fixed start; training seeds are far below."""
+
+
+@dataclasses.dataclass(frozen=True)
+class HindsightConfig:
+    """What every agent with hindsight is told."""
+
+    preset: Literal["default", "paper"] = "default"
+    """Where the other values come from: what learns fastest on two cores, or the paper's appendix."""
+    environment: str = "navigate-2m"
+    """One of the simulator's environments."""
+    hindsight: Literal["halgan", "oracle", "none"] = "halgan"
+    """Who paints the goal into failed transitions: the GAN, the simulator itself, or nobody."""
+    weights: Path | None = None
+    """Generator to hallucinate with; by default the one shipped for the environment."""
+    bank: bool = True
+    """Look hallucinations up in a table of the generator's output, made at the start, instead of asking it."""
+    share_latent: bool = True
+    """Show one and the same goal in both images of a row, instead of drawing a latent for each."""
+    allow_other_mujoco: bool = False
+    """Accept weights trained with another release of MuJoCo, whose images may differ."""
+    seed: int = 0
+    """Seed of everything random in the run."""
+    total_frames: int = 15_000
+    """Environment steps."""
+    out: Path = Path("runs/agent")
+    """Folder of the run; must not hold one yet."""
+    threads: int = 1
+    """Threads of PyTorch; more do not help networks this small, and change the last bits of every sum."""
+    tensorboard: bool = False
+    """Also write TensorBoard logs (needs the `tensorboard` extra)."""
+
+    replay_capacity: int = 100_000
+    """Rows of the replay buffer."""
+    warmup_frames: int = 2_000
+    """Frames collected with random actions before the first update."""
+    batch_size: int = 32
+    """Rows an update."""
+    frames_per_update: int = 1
+    """Environment steps for each update."""
+    frames_per_batch: int = 16
+    """Environment steps collected at a time."""
+    discount: float = 0.95
+    """Discount factor."""
+    target_rate: float = 2e-2
+    """How far the target networks move towards the networks at each update."""
+    clip_targets: bool = True
+    """Clip the targets of values to [-1, 1]."""
+    downsample: Literal["stride", "max_pool"] = "stride"
+    """How the convolutions halve the image."""
+    policy_average: float = 0.998
+    """Decay of the moving average of the policy's weights, which is evaluated and saved; 0 takes the last ones."""
+
+    epsilon_start: float = 1.0
+    """Share of uniformly random actions at the start."""
+    epsilon_end: float = 0.3
+    """Share of uniformly random actions at the end."""
+    epsilon_frames: int = 20_000
+    """Frames over which the share falls."""
+
+    hallucination_start: float = 0.3
+    """Probability that a sampled row is relabelled, at the start."""
+    hallucination_end: float = 0.0
+    """Probability that a sampled row is relabelled, at the end."""
+    hallucination_frames: int = 60_000
+    """Frames over which the probability falls."""
+    max_distance: int = 96
+    """Longest failed snippet: the goal lies 1 to this many steps ahead."""
+    nearness: float = 2.0
+    """Preference for near goals: the steps to the goal are uniform to this power; 1 is uniform."""
+    goal_distance: float = 0.01
+    """A hindsight goal is reached within this distance [m] ..."""
+    goal_angle: float = 0.1
+    """... and this angle [rad]."""
+
+    evaluate_every: int = 2_000
+    """Frames between evaluations."""
+    evaluation_starts: int = 50
+    """Fixed starts of an evaluation."""
+    film_starts: int = 5
+    """How many of these starts `agent.gif` shows."""
+
+    def __post_init__(self) -> None:
+        """Refuse values that would fail only later."""
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if type(field.default) is int and field.name != "seed" and value < 1:
+                raise ValueError(f"{field.name} must be at least 1, got {value}")
+        for name in ("hallucination_start", "hallucination_end", "epsilon_start", "epsilon_end"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} is a share: it must lie in [0, 1], got {getattr(self, name)}")
+        if self.warmup_frames < self.max_distance:
+            raise ValueError(
+                f"warmup_frames={self.warmup_frames} is below max_distance={self.max_distance}: rows wait that long "
+                "for their future before they can be sampled; warm up longer"
+            )
+
+
+Config = TypeVar("Config", bound=HindsightConfig)
+
+
+def run(config: Config, make_agent: Callable[[Config, TensorSpec], Agent], simulator: Simulator) -> float:
+    """Train an agent, evaluate it, and write everything into `config.out`.
+
+    Args:
+        config: what to do.
+        make_agent: makes the agent for a configuration and the environment's actions.
+        simulator: where the environments are from.
+
+    Returns:
+        The success rate at the end.
+
+    Raises:
+        FileExistsError: if `config.out` already holds anything.
+        ValueError: if the environment is unknown, or the weights do not fit it.
+    """
+    check_unused(config.out)
+    torch.set_num_threads(config.threads)
+    hallucinator = make_hallucinator(config, simulator)
+    torch.manual_seed(config.seed)  # After the hallucinator: with one seed all methods start from the same agent.
+
+    # The environment, one more for evaluation, and the agent.
+    env, evaluation_env = simulator.make(config.environment, seed=config.seed), simulator.make(config.environment)
+    agent = make_agent(config, env.action_spec)
+
+    # Replay with hindsight: failed rows come out of the buffer as successes.
+    hindsight = make_hindsight(config, hallucinator)
+    buffer = make_buffer(config, hindsight)
+    collector = make_collector(config, env, agent.explorer)
+
+    # Learning.
+    flags = simulator.pose_flags(config.environment)
+    columns = (*COLUMNS, *(f"train/{name}" for name in agent.figures.values()), *(f"eval/{flag}" for flag in flags))
+    folder = RunFolder(config.out, columns=columns)
+    folder.write_config(dataclasses.asdict(config))
+    starts = range(EVALUATION_SEED, EVALUATION_SEED + config.evaluation_starts)
+    policy = train(
+        agent,
+        collector,
+        buffer,
+        hindsight=hindsight,
+        schedule=Schedule(config.total_frames, config.warmup_frames, config.frames_per_update, config.evaluate_every),
+        policy_average=config.policy_average,
+        evaluate=partial(evaluate, evaluation_env, seeds=starts, flags=flags),
+        folder=folder,
+        save=partial(save_policy, folder, config, simulator),
+        logger=make_tensorboard(config),
+        label=config.hindsight,
+    )
+    collector.shutdown()
+
+    # Pictures.
+    draw_pictures(folder, config, evaluation_env, policy)
+    if hallucinator is not None:
+        painters = {"true goal": simulator.GoalRenderer(config.environment), config.hindsight: hallucinator}
+        draw_hallucinations(folder.file("hallucinations.png"), config, buffer, painters)
+    return read_metrics(folder.file("metrics.csv"))["eval/success_rate"][-1]
+
+
+def make_hallucinator(config: HindsightConfig, simulator: Simulator) -> Hallucinator | None:
+    """Return who paints the goal; weights that do not fit the environment are refused here."""
+    if config.hindsight == "none":
+        return None
+    if config.hindsight == "oracle":
+        return simulator.GoalRenderer(config.environment)
+    path = config.weights or shipped_weights(config.environment)
+    generator = load_generator(
+        path,
+        expected=simulator.fingerprint(config.environment),
+        pose_size=3 + len(simulator.pose_flags(config.environment)),
+        allow_other_mujoco=config.allow_other_mujoco,
+    )
+    rng = torch.Generator().manual_seed(config.seed)
+    if config.bank:
+        grid = BankGrid(goal_offset=simulator.goal_offsets(config.environment))
+        return HallucinationBank(generator, grid, rng=rng, share_latent=config.share_latent)
+    return GanHallucinator(generator, rng=rng, share_latent=config.share_latent)
+
+
+def make_hindsight(config: HindsightConfig, hallucinator: Hallucinator | None) -> Compose | None:
+    """Return the replay transform of the chosen method."""
+    if hallucinator is None:
+        return None
+    pipeline = pipelines.oracle if config.hindsight == "oracle" else pipelines.halgan
+    return pipeline(
+        hallucinator,
+        max_distance=config.max_distance,
+        nearness=config.nearness,
+        probability=config.hallucination_start,
+        final_probability=config.hallucination_end,
+        annealing_steps=config.hallucination_frames,
+        tolerance=PoseTolerance(config.goal_distance, config.goal_angle),
+        generator=torch.Generator().manual_seed(config.seed),
+    )
+
+
+def make_collector(config: HindsightConfig, env: EnvBase, explorer: TensorDictModuleBase) -> Collector:
+    """Return what steps the environment: uniformly random actions first, then the exploring policy."""
+    return Collector(
+        env,
+        explorer,
+        frames_per_batch=config.frames_per_batch,
+        total_frames=config.total_frames,
+        init_random_frames=config.warmup_frames,
+        track_traj_ids=False,
+        auto_register_policy_transforms=False,
+    )
+
+
+def make_buffer(config: HindsightConfig, hindsight: Compose | None) -> TensorDictReplayBuffer:
+    """Return the replay buffer; room for final frames suffices for episodes of four steps on average."""
+    return TensorDictReplayBuffer(
+        storage=FrameStorage(config.replay_capacity, extra_frames=config.replay_capacity // 4),
+        batch_size=config.batch_size,
+        transform=hindsight,
+        generator=torch.Generator().manual_seed(config.seed),
+    )
+
+
+def make_tensorboard(config: HindsightConfig) -> Logger | None:
+    """Return TorchRL's TensorBoard logger if it was asked for."""
+    if not config.tensorboard:
+        return None
+    if find_spec("tensorboard") is None:
+        raise ImportError("--tensorboard needs the extra: pip install 'halgan-rl[tensorboard]'")
+    return TensorboardLogger(exp_name="tensorboard", log_dir=str(config.out))
+
+
+def save_policy(folder: RunFolder, config: HindsightConfig, simulator: Simulator, network: nn.Module) -> None:
+    """Write `policy.safetensors` with all that is needed to rebuild and trust it."""
+    manifest = {
+        "kind": network.kind,
+        "arguments": network.arguments,
+        **simulator.fingerprint(config.environment),
+        "config": dataclasses.asdict(config),
+        "versions": versions(),
+    }
+    save_weights(folder.file("policy.safetensors"), network, manifest)
+
+
+def draw_pictures(folder: RunFolder, config: HindsightConfig, env: EnvBase, policy: TensorDictModuleBase) -> None:
+    """Draw the learning curve, and film the trained agent."""
+    curve = read_metrics(folder.file("metrics.csv"))
+    pictures.draw_learning_curves(folder.file("curve.png"), {config.hindsight: [curve]}, title=title_of(config))
+    starts = range(EVALUATION_SEED, EVALUATION_SEED + config.film_starts)
+    film = record(env, policy, partial(env.render_overview, 256, 320), seeds=starts)
+    pictures.write_gif(folder.file("agent.gif"), film)
+
+
+def draw_hallucinations(
+    path: Path, config: HindsightConfig, buffer: TensorDictReplayBuffer, painters: Mapping[str, Hallucinator]
+) -> None:
+    """Draw stored rows: the frame as it was, a goal some steps ahead truly rendered, and as the agent is shown it."""
+    steps = min(12, config.max_distance)
+    rows = buffer.storage[torch.linspace(0, len(buffer) - 1, 200).long()]  # past the transform, which would relabel
+    rows = rows[rows["hindsight", "horizon"].squeeze(-1) >= steps][::16]
+    goal = rows["hindsight", "pose"][:, [steps - 1]]
+    frames, poses = rows["pixels"].unsqueeze(1), rows["pose"].unsqueeze(1)
+    painted = {label: painter(frames, poses, goal).squeeze(1) for label, painter in painters.items()}
+    pictures.draw_frame_grid(path, {"failed": rows["pixels"], **painted}, title=title_of(config))
+
+
+def title_of(config: HindsightConfig) -> str:
+    """Return what the pictures of a run are headed with."""
+    return f"{config.environment}, {config.hindsight}, seed {config.seed}"

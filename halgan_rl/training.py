@@ -1,0 +1,189 @@
+"""The loop that all agents share: collect, replay with hindsight, update, evaluate."""
+
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.envs import Compose
+from torchrl.modules import EGreedyModule
+from torchrl.objectives import LossModule, TargetNetUpdater
+from torchrl.record.loggers import Logger
+from tqdm import tqdm
+
+from halgan_rl.evaluation import Evaluation
+from halgan_rl.run_folder import RunFolder
+
+COLUMNS = (
+    "frames",
+    "seconds",
+    "eval/success_rate",
+    "eval/return",
+    "eval/episode_length",
+    "train/success_rate",
+    "train/hallucinated_fraction",
+    "train/epsilon",
+)
+"""What :func:`train` writes whatever the loss; its own entries come beside them."""
+
+
+@dataclass
+class Agent:
+    """An agent that learns.
+
+    Attributes:
+        network: chooses the actions; what is averaged, evaluated and saved.
+        make_policy: wraps the network, or an average of it, as a deterministic policy.
+        explorer: the network with its exploration; what collects.
+        epsilon: the part of the explorer that acts at random, less and less.
+        loss: TorchRL's loss.
+        optimizer: of all parameters of the loss.
+        target_updater: moves the target networks.
+        figures: which of the loss's outputs to report, and as what: under ``train/`` and these names.
+    """
+
+    network: nn.Module
+    make_policy: Callable[[nn.Module], TensorDictModuleBase]
+    explorer: TensorDictModuleBase
+    epsilon: EGreedyModule
+    loss: LossModule
+    optimizer: torch.optim.Optimizer
+    target_updater: TargetNetUpdater
+    figures: Mapping[str, str]
+
+    def update(self, batch: TensorDictBase) -> TensorDictBase:
+        """Make one update; return the loss module's output."""
+        losses = self.loss(batch)
+        sum(value for name, value in losses.items() if name.startswith("loss")).backward()
+        self.optimizer.step()
+        self.optimizer.zero_grad()
+        self.target_updater.step()
+        return losses
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """When what happens, in environment frames.
+
+    Attributes:
+        total_frames: how long training lasts.
+        warmup_frames: frames before the first update.
+        frames_per_update: frames for each update.
+        evaluate_every: frames from one evaluation to the next.
+    """
+
+    total_frames: int
+    warmup_frames: int
+    frames_per_update: int
+    evaluate_every: int
+
+    def updates_due(self, frames: int) -> int:
+        """Return how many updates there should have been after so many frames."""
+        return max(frames - self.warmup_frames, 0) // self.frames_per_update
+
+
+def train(
+    agent: Agent,
+    collector: Iterable[TensorDictBase],
+    buffer: TensorDictReplayBuffer,
+    *,
+    hindsight: Compose | None,
+    schedule: Schedule,
+    policy_average: float,
+    evaluate: Callable[[TensorDictModuleBase], Evaluation],
+    folder: RunFolder,
+    save: Callable[[nn.Module], None],
+    logger: Logger | None = None,
+    label: str = "",
+) -> TensorDictModuleBase:
+    """Train an agent, with a progress bar; write metrics and weights at each evaluation.
+
+    Args:
+        agent: what learns, in place.
+        collector: yields transitions ``[T]``, in all as many as the schedule has frames.
+        buffer: where they go; samples come with hindsight.
+        hindsight: the buffer's pipeline, see :mod:`halgan_rl.pipelines`, whose probability this anneals; None for none.
+        schedule: when what happens.
+        policy_average: decay of the moving average of the network's weights, which is evaluated and saved; 0 takes the
+            last weights.
+        evaluate: judges a policy.
+        folder: gets a row of metrics at each evaluation.
+        save: keeps the averaged network at each evaluation.
+        logger: gets the metrics as well.
+        label: what the progress bar is headed with.
+
+    Returns:
+        The policy of the averaged network.
+    """
+    started = time.perf_counter()
+    average = AveragedModel(agent.network, multi_avg_fn=get_ema_multi_avg_fn(policy_average))
+    policy = agent.make_policy(average.module)
+    means = Means()
+    frames, updates, next_evaluation, success = 0, 0, schedule.evaluate_every, float("nan")
+    progress = tqdm(total=schedule.total_frames, unit="frame", desc=label, dynamic_ncols=True)
+    for rollout in collector:
+        buffer.extend(rollout)
+        frames += rollout.numel()
+        agent.epsilon.step(rollout.numel())
+        if hindsight is not None:
+            hindsight[1].step(rollout.numel())
+        if (done := rollout["next", "done"]).any():
+            means.add(success_rate=rollout["next", "terminated"][done].float().mean())
+
+        while updates < schedule.updates_due(frames):
+            batch = buffer.sample()
+            losses = agent.update(batch)
+            average.update_parameters(agent.network)
+            updates += 1
+            relabelled = batch["goal", "mask"].float().mean() if hindsight is not None else torch.zeros(())
+            figures = {shown: losses[name] for name, shown in agent.figures.items()}
+            means.add(hallucinated_fraction=relabelled, **figures)
+
+        if frames >= next_evaluation or frames >= schedule.total_frames:
+            next_evaluation += schedule.evaluate_every
+            evaluation = evaluate(policy)
+            success = evaluation.success_rate
+            metrics = dict.fromkeys(folder.columns, float("nan"))  # what there is none of yet
+            metrics |= {"frames": frames, "seconds": time.perf_counter() - started}
+            metrics |= {"train/epsilon": float(agent.epsilon.eps)} | evaluation.metrics()
+            metrics |= {f"train/{name}": value for name, value in means.pop().items()}
+            folder.write_metrics(metrics)
+            save(average.module)
+            if logger is not None:
+                for name, value in metrics.items():
+                    logger.log_scalar(name, value, step=frames)
+        progress.update(rollout.numel())
+        progress.set_postfix(success=f"{success:.0%}", updates=updates, refresh=False)
+    progress.close()
+    return policy
+
+
+class Means:
+    """Means of figures between two evaluations, without a synchronisation an update.
+
+    Examples:
+        >>> means = Means()
+        >>> means.add(loss=torch.tensor([1.0, 3.0]))
+        >>> means.add(loss=torch.tensor(4.0))
+        >>> means.pop(), means.pop()
+        ({'loss': 3.0}, {})
+    """
+
+    def __init__(self) -> None:
+        self._values: dict[str, list[Tensor]] = {}
+
+    def add(self, **values: Tensor) -> None:
+        """Add a value, or the mean of several, to each named mean."""
+        for name, value in values.items():
+            self._values.setdefault(name, []).append(value.detach().float().mean())
+
+    def pop(self) -> dict[str, float]:
+        """Return all means and start afresh."""
+        means = {name: float(torch.stack(values).mean()) for name, values in self._values.items()}
+        self._values = {}
+        return means
