@@ -46,7 +46,6 @@ Differences from the paper (Sahni et al., NeurIPS 2019, appendix), all undone by
 """
 
 import dataclasses
-import math
 import shlex
 import sys
 import time
@@ -98,7 +97,7 @@ class Config:
     """Seed of everything random in the run."""
     iterations: int = 0
     """Generator steps of the game, after the warm start."""
-    minutes: float = math.inf
+    minutes: float | None = None
     """Stop training after this long, whatever is left to do; what is kept then depends on the machine's speed."""
     near_goal_frames: int = 2_000
     """Size of R, the near-goal frames."""
@@ -147,7 +146,7 @@ class Config:
         for name in ("iterations", "warm_start_steps", "steps_before_goal"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name}={getattr(self, name)} must not be negative")
-        if not self.minutes > 0:
+        if self.minutes is not None and not self.minutes > 0:
             raise ValueError(f"minutes={self.minutes} must be positive")
         if self.warm_start_steps and self.generator == "paper":
             raise ValueError(
@@ -200,7 +199,7 @@ def main(config: Config) -> None:
         metrics.update(losses)
         progress.update()
         seconds = time.perf_counter() - started
-        over = seconds > 60 * config.minutes or progress.n == progress.total
+        over = progress.n == progress.total or (config.minutes is not None and seconds > 60 * config.minutes)
         if over or progress.n % config.evaluate_every == 0:
             metrics.update(compare_with_truth(config, kept, truth, folder.file("hallucinations.png")))
             metrics.update(steps=progress.n, seconds=seconds)
