@@ -23,8 +23,9 @@ from torchrl.data import Bounded
 import envs
 from benchmarks.rounds import alternate, seconds_a_call, warm_heap
 from benchmarks.tables import Table, report
+from halgan_rl.ddpg import make_agent
 from halgan_rl.experiment import make_buffer, make_hallucinator, make_hindsight
-from recipes.ddpg_navigate import Config, make_agent
+from recipes.ddpg_navigate import Config
 
 PAINTERS: dict[str, dict[str, Any]] = {
     "bank": {"bank": True},

@@ -30,9 +30,10 @@ from benchmarks import sb3_peers
 from benchmarks.rounds import alternate, seconds_a_call, warm_heap
 from benchmarks.rows import Rows, channels_first, plain
 from benchmarks.tables import Table, report
+from halgan_rl.ddpg import make_agent
 from halgan_rl.experiment import make_buffer
 from halgan_rl.models.agents import Actor, Critic, Downsample
-from recipes.ddpg_navigate import Config, make_agent
+from recipes.ddpg_navigate import Config
 
 Update = Callable[[], object]
 Counts = tuple[int, ...]

@@ -23,7 +23,8 @@ from halgan_rl import pictures, pipelines
 from halgan_rl.evaluation import evaluate, record
 from halgan_rl.frame_storage import FrameStorage
 from halgan_rl.hallucination_bank import BankGrid, HallucinationBank
-from halgan_rl.hallucinators import GanHallucinator, Hallucinator
+from halgan_rl.hallucinators import GanHallucinator, Hallucinator, RandomFlags
+from halgan_rl.models.halgan import HallucinationGenerator
 from halgan_rl.poses import PoseTolerance
 from halgan_rl.run_folder import RunFolder, check_unused, read_metrics, versions
 from halgan_rl.training import COLUMNS, Agent, Schedule, train
@@ -69,6 +70,8 @@ class HindsightConfig:
     """Look hallucinations up in a table of the generator's output, made at the start, instead of asking it."""
     share_latent: bool = True
     """Show one and the same goal in both images of a row, instead of drawing a latent for each."""
+    random_flags: bool = False
+    """Paint a goal drawn at random, in tasks with several, instead of the one that is pursued."""
     allow_other_mujoco: bool = False
     """Accept weights trained with another release of MuJoCo, whose images may differ."""
     seed: int = 0
@@ -223,8 +226,16 @@ def make_hallucinator(config: HindsightConfig, simulator: Simulator) -> Hallucin
         allow_other_mujoco=config.allow_other_mujoco,
     )
     rng = torch.Generator().manual_seed(config.seed)
+    hallucinator = make_painter(config, generator, simulator.goal_offsets(config.environment), rng)
+    return RandomFlags(hallucinator, rng=rng) if config.random_flags else hallucinator
+
+
+def make_painter(
+    config: HindsightConfig, generator: HallucinationGenerator, goal_offsets: tuple[float, ...], rng: torch.Generator
+) -> Hallucinator:
+    """Return what paints with a generator."""
     if config.bank:
-        grid = BankGrid(goal_offset=simulator.goal_offsets(config.environment))
+        grid = BankGrid(goal_offset=goal_offsets)
         return HallucinationBank(generator, grid, rng=rng, share_latent=config.share_latent)
     return GanHallucinator(generator, rng=rng, share_latent=config.share_latent)
 

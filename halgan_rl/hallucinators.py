@@ -64,6 +64,26 @@ class GanHallucinator:
         return to_uint8(self._generator.compose(to_float(pixels), self._generator(features, latent)))
 
 
+class RandomFlags:
+    """Has a hallucinator paint goals that flags drawn at random select, instead of those of the poses.
+
+    So do the paper's authors in tasks with several goals, in which the flags of a pose tell the one that is pursued.
+
+    Args:
+        hallucinator: paints.
+        rng: draws one setting of the flags for all images of a row.
+    """
+
+    def __init__(self, hallucinator: Hallucinator, *, rng: torch.Generator) -> None:
+        self._hallucinator, self._rng = hallucinator, rng
+
+    def __call__(self, pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
+        """Paint the goals, see :class:`Hallucinator`."""
+        flags = torch.randint(2, (len(pose), 1, pose.shape[-1] - 3), generator=self._rng).to(pose)
+        pose = torch.cat([pose[..., :3], flags.expand(*pose.shape[:-1], -1)], -1)
+        return self._hallucinator(pixels, pose, goal_pose)
+
+
 def check_poses(size: int, **poses: Tensor) -> None:
     """Refuse poses that a generator trained on poses of ``size`` entries cannot know.
 

@@ -48,7 +48,7 @@ class Agent:
     """
 
     network: nn.Module
-    make_policy: Callable[[nn.Module], TensorDictModuleBase]
+    make_policy: Callable[..., TensorDictModuleBase]
     explorer: TensorDictModuleBase
     epsilon: EGreedyModule
     loss: LossModule

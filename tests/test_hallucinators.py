@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from halgan_rl.hallucinators import GanHallucinator
+from halgan_rl.hallucinators import GanHallucinator, RandomFlags
 from halgan_rl.models.coordinates import CoordinateGenerator
 from halgan_rl.models.halgan import PaperGenerator
 from tests.synthetic import vivid_generator
@@ -64,6 +64,22 @@ def test_each_frame_shows_the_goal_as_seen_from_its_own_pose(generator: Coordina
     swapped = hallucinator(generator)(pixels, pose.flip(1), torch.tensor([[[1.0, 0.0, 0.0]]]))
     assert not torch.equal(painted[:, 0], painted[:, 1])
     assert (painted.int() - swapped.flip(1).int()).abs().max() <= 1
+
+
+def test_random_flags_replace_those_of_the_poses_alike_in_all_images_of_a_row() -> None:
+    seen: list[Tensor] = []
+
+    def spy(pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
+        seen.append(pose)
+        return pixels
+
+    pose = torch.rand(64, 2, 4)
+    pose[..., 3] = 1
+    RandomFlags(spy, rng=torch.Generator().manual_seed(0))(torch.zeros(64, 2, 1, 1, 3), pose, pose[:, :1])
+    assert torch.equal(seen[0][..., :3], pose[..., :3])
+    flags = seen[0][..., 3]
+    assert torch.equal(flags[:, 0], flags[:, 1])
+    assert 20 < flags[:, 0].sum() < 44
 
 
 def test_an_opacity_of_0_keeps_every_bit(rows: tuple[Tensor, ...]) -> None:

@@ -1,0 +1,51 @@
+"""Double DQN on camera images, out of TorchRL's parts."""
+
+import dataclasses
+
+import torch
+from tensordict.nn import TensorDictSequential
+from torchrl.data import TensorSpec
+from torchrl.modules import EGreedyModule, QValueActor
+from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
+
+from halgan_rl.experiment import HindsightConfig
+from halgan_rl.models.agents import QNetwork, greedy_policy
+from halgan_rl.objectives import ClippedTD0Estimator
+from halgan_rl.training import Agent
+
+
+@dataclasses.dataclass(frozen=True)
+class DDQNConfig(HindsightConfig):
+    """What a DDQN agent with hindsight is told."""
+
+    learning_rate: float = 1e-3
+    """Adam's learning rate."""
+
+
+def make_agent(config: DDQNConfig, action_spec: TensorSpec) -> Agent:
+    """Return a network of action values on the camera image alone, how it explores, and how it learns."""
+    network = QNetwork(action_spec.shape[-1], downsample=config.downsample)
+    actor = greedy_policy(network)
+    epsilon = EGreedyModule(action_spec, config.epsilon_start, config.epsilon_end, config.epsilon_frames)
+    loss = make_loss(config, actor)
+    return Agent(
+        network=network,
+        make_policy=greedy_policy,
+        explorer=TensorDictSequential(actor, epsilon),
+        epsilon=epsilon,
+        loss=loss,
+        optimizer=torch.optim.Adam(loss.value_network_params.values(True, True), config.learning_rate, fused=True),
+        target_updater=SoftUpdate(loss, tau=config.target_rate),
+        figures={"loss": "loss"},
+    )
+
+
+def make_loss(config: DDQNConfig, actor: QValueActor) -> DQNLoss:
+    """Return TorchRL's double-DQN loss with the targets that the configuration asks for."""
+    loss = DQNLoss(actor, delay_value=True, double_dqn=True, action_space="one_hot")
+    if config.clip_targets:
+        estimator = ClippedTD0Estimator(low=-1.0, high=1.0, gamma=config.discount, value_network=loss.value_network)
+        loss.make_value_estimator(estimator)
+    else:
+        loss.make_value_estimator(ValueEstimators.TD0, gamma=config.discount)
+    return loss
