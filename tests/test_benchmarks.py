@@ -53,7 +53,7 @@ def test_different_networks_are_refused(monkeypatch):
 
 def test_the_cost_of_hindsight_is_measured_on_the_recipes_update():
     config = update_cost.Config(hindsight="none", batch_size=4, replay_capacity=EPISODE)
-    update_cost.make_update(config, Rows(64).take(EPISODE))()
+    update_cost.make_update(config, Rows(64).take(EPISODE), None)()
 
 
 def test_rounds_alternate_and_the_first_does_not_count():
