@@ -32,7 +32,7 @@ bench: $(BENCH_VENV)/ready  ## speed and memory side by side with the peers, in 
 	  $(BENCH_VENV)/bin/python -m benchmarks.$$benchmark || exit 1; done
 
 weights: $(VENV)/ready  ## train the shipped generators again (a few minutes)
-	for environment in navigate-2m navigate-4m; do \
+	for environment in navigate-2m navigate-4m pick-and-place-2m pebble; do \
 	  run=runs/weights-$$environment shipped=halgan_rl/shipped/$$environment; \
 	  $(BIN)/python recipes/train_halgan.py --environment $$environment --seed 0 --out $$run && \
 	  cp $$run/generator.safetensors $$shipped.safetensors && \

@@ -3,12 +3,17 @@
 import re
 from pathlib import Path
 
-README = Path(__file__).parents[1] / "README.md"
+import pytest
+
+import envs
+
+ROOT = Path(__file__).parents[1]
+README, CONTRIBUTING = ROOT / "README.md", ROOT / "CONTRIBUTING.md"
 
 
-def run_examples() -> list[dict]:
+def run_examples(document: Path) -> list[dict]:
     scopes: list[dict] = []
-    for example in re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL):
+    for example in re.findall(r"```python\n(.*?)```", document.read_text(), re.DOTALL):
         scopes.append({})
         exec(example, scopes[-1])
         scopes[-1]["env"].close()
@@ -16,9 +21,19 @@ def run_examples() -> list[dict]:
 
 
 def test_the_examples_run_relabel_rows_and_fix_a_start() -> None:
-    replay, gymnasium = run_examples()
+    replay, gymnasium = run_examples(README)
     assert replay["batch"]["goal", "mask"].any()
     assert gymnasium["observation"]["pose"].tolist() == [0, 0, 0.5]
+
+
+def test_the_task_that_contributing_adds_can_be_solved_and_gives_near_goal_frames(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(envs.NAMES, "look-at-2m", None)  # so that it is gone afterwards
+    (added,) = run_examples(CONTRIBUTING)
+    assert added["near_goal"]["pixels"].shape == (100, 64, 64, 3)
+    box = added["near_goal"]["pixels"][-1].astype(int)
+    assert (box[..., 2] - box[..., 0] > 80).sum() > 20  # something blue is ahead
 
 
 def test_every_file_that_is_linked_exists() -> None:
