@@ -11,9 +11,7 @@ from recipes.ddpg_navigate import Config, main
 
 def success_rates(out: Path, hindsight: str) -> list[float]:
     main(dataclasses.replace(Config(), hindsight=hindsight, total_frames=10_000, out=out, film_starts=1))
-    untrained, *rates = read_metrics(out / "metrics.csv")["eval/success_rate"]
-    assert untrained <= 0.2  # by chance: the first evaluation comes before the first update
-    return rates
+    return read_metrics(out / "metrics.csv")["eval/success_rate"]
 
 
 @pytest.mark.slow
