@@ -86,7 +86,7 @@ class GoalTask(composer.Task):
     def _attach(self) -> None:
         self.robot.attach_to(self.arena)
         for goal in self.goals.values():
-            self.arena.attach_mocap(goal.box)
+            self.arena.attach_mocap(goal.prop)
 
     def _make_observables(self) -> dict[str, KnownSpec]:
         pixels = specs.BoundedArray((*self.robot.image_size, 3), np.uint8, 0, 255, name="pixels")
@@ -167,7 +167,7 @@ class GoalTask(composer.Task):
 
     def goal_position(self, physics: Any) -> np.ndarray:
         """Where the goal stands that is pursued at present, x, y [m]; privileged: no agent may ask."""
-        return self.goal(self.pose(physics)).box.position(physics)
+        return self.goal(self.pose(physics)).prop.position(physics)
 
     def is_success(self, pose: np.ndarray, position: np.ndarray) -> bool:
         """Whether a robot at pose [P] has reached the goal it pursues, if that stands at position [2]."""
@@ -185,16 +185,16 @@ class GoalTask(composer.Task):
         """
         self.robot.set_pose(physics, pose[:3])
         for goal in self.goals.values():
-            goal.box.set_position(physics, _OUT_OF_SIGHT)
+            goal.prop.set_position(physics, _OUT_OF_SIGHT)
         if goal_position is not None:
-            self.goal(pose).box.set_position(physics, goal_position)
+            self.goal(pose).prop.set_position(physics, goal_position)
 
     def initialize_episode(self, physics: Any, random_state: np.random.RandomState) -> None:
         """Places robot and boxes where :meth:`fix_start` says, else at random."""
         start = self.draw_start(random_state, self._fixed)
         self.robot.set_pose(physics, start["pose"])
         for name, goal in self.goals.items():
-            goal.box.set_position(physics, start[name])
+            goal.prop.set_position(physics, start[name])
         self._succeeded = False
         self._energy = 0.0
 
@@ -217,7 +217,7 @@ class GoalTask(composer.Task):
     def _check_start(self, fixed: Mapping[str, np.ndarray]) -> None:
         self._check_in_room("pose", fixed, self.robot.radius)
         for name, goal in self.goals.items():
-            self._check_in_room(name, fixed, goal.box.size / 2)
+            self._check_in_room(name, fixed, goal.prop.size / 2)
             self._check_robot_apart(name, fixed)
         for one, other in combinations(self.goals, 2):
             self._check_boxes_apart(one, other, fixed)
@@ -236,18 +236,18 @@ class GoalTask(composer.Task):
     def _check_robot_apart(self, name: str, fixed: Mapping[str, np.ndarray]) -> None:
         if not {"pose", name} <= fixed.keys():
             return
-        box, pose, position = self.goals[name].box, fixed["pose"], fixed[name]
-        gap = np.hypot(*np.maximum(np.abs(pose[:2] - position) - box.size / 2, 0)) - self.robot.radius
+        prop, pose, position = self.goals[name].prop, fixed["pose"], fixed[name]
+        gap = np.hypot(*np.maximum(np.abs(pose[:2] - position) - prop.size / 2, 0)) - self.robot.radius
         if gap < 0:
             raise ValueError(
                 f"pose={pose.tolist()} and {name}={position.tolist()} overlap by {-gap:.3f} m: move them apart, "
-                f"{self.robot.radius + box.radius:.3f} m between the centres are always enough."
+                f"{self.robot.radius + prop.radius:.3f} m between the centres are always enough."
             )
 
     def _check_boxes_apart(self, one: str, other: str, fixed: Mapping[str, np.ndarray]) -> None:
         if not {one, other} <= fixed.keys():
             return
-        nearest = (self.goals[one].box.size + self.goals[other].box.size) / 2
+        nearest = (self.goals[one].prop.size + self.goals[other].prop.size) / 2
         if np.abs(fixed[one] - fixed[other]).max() < nearest:
             raise ValueError(
                 f"{one}={fixed[one].tolist()} and {other}={fixed[other].tolist()} overlap: move them apart, "

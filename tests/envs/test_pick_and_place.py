@@ -46,7 +46,7 @@ def held(timesteps):
 
 
 def box_position(environment, name):
-    return environment.task.goals[name].box.position(environment.physics)
+    return environment.task.goals[name].prop.position(environment.physics)
 
 
 def red(image):
@@ -281,8 +281,8 @@ def test_impossible_starts_are_refused_and_the_episode_goes_on(environment, star
         ({"min_box_distance": float("nan")}, "min_box_distance=nan"),
         ({"min_start_distance": 0.15}, "min_start_distance=0.15 m must exceed 0.16 m"),
         ({"min_box_distance": 0.29}, r"min_box_distance=0.29 m must exceed .* = 0.29 m, or the pick-up may deliver"),
-        ({"pick_up_distance": 0.07}, "pick_up_distance=0.07 m cannot be reached: robot and box touch at 0.070 m"),
-        ({"delivery_distance": 0.08}, "delivery_distance=0.08 m cannot be reached: robot and box touch at 0.090 m"),
+        ({"pick_up_distance": 0.07}, "pick_up_distance=0.07 m cannot be reached: robot and goal touch at 0.070 m"),
+        ({"delivery_distance": 0.08}, "delivery_distance=0.08 m cannot be reached: robot and goal touch at 0.090 m"),
         ({"pick_up_tolerance": 0.0}, "pick_up_tolerance must be positive; got 0.0 m"),
         ({"delivery_tolerance": -0.1}, "delivery_tolerance must be positive; got -0.1 m"),
         ({"carry_height": -0.01}, "carry_height must not be negative; got -0.01 m"),

@@ -30,7 +30,7 @@ def pebble_env():
 def place(env, pose, box):
     env.reset()
     env.robot.set_pose(env.environment.physics, np.array(pose))
-    env.environment.task.goals["box"].box.set_position(env.environment.physics, np.array(box))
+    env.environment.task.goals["box"].prop.set_position(env.environment.physics, np.array(box))
     env.environment.physics.forward()
 
 
