@@ -220,6 +220,13 @@ def test_drawn_starts_are_apart_from_each_other_and_from_the_walls(environment):
     assert 0.7 < np.abs([red_box, green_box]).max() <= 1 - 0.16 - 0.05
 
 
+def test_no_box_starts_farther_from_the_robot_than_asked_for():
+    task, random_state = make_task(max_start_distance=0.9), np.random.RandomState(0)
+    starts = [task.draw_start(random_state) for _ in range(500)]
+    farthest = {name: max(np.hypot(*(drawn["pose"][:2] - drawn[name])) for drawn in starts) for name in task.goals}
+    assert all(0.85 < distance <= 0.9 for distance in farthest.values())
+
+
 def test_equal_seeds_give_equal_episodes():
     first, again, other = (run_episode(seed) for seed in (7, 7, 8))
     for one, same in zip(first, again, strict=True):
