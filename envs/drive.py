@@ -28,11 +28,13 @@ class ArrowKeys:
     def action(self, robot: Any) -> Any:
         """An action: up and down drive at full speed, left and right turn at the full rate, no key stands still.
 
+        Without a reverse gear, down stands still too.
+
         Args:
             robot: Who acts.
 
         Returns:
-            The action; None if no key is held and the robot has no action that stands still.
+            The action; None if the keys ask to stand still and the robot has no action that does.
         """
         forward, turn = self._axis("up", "down"), self._axis("left", "right")
         speed = forward * (robot.max_speed if forward > 0 else robot.reverse_speed)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from envs.environment import Environment
-from envs.tasks.goal import in_robot_frame
+from envs.tasks.goal import Goal, in_robot_frame
 from envs.transition import random_action
 
 _CALM_DISTANCE = 2.5
@@ -29,7 +29,8 @@ class NoisyDriver:
     """Steers to the goal, mixed with uniformly random actions; privileged.
 
     Each episode draws how noisy it is near the goal, so that its last steps look by turns like a drive and like the
-    wandering of an untrained agent.
+    wandering of an untrained agent. One that came too close backs up; a robot without a reverse gear takes no random
+    action that leads there, and if it is there, it drives on, over the goal or past it, and turns back.
 
     Args:
         environment: Where it drives.
@@ -56,13 +57,22 @@ class NoisyDriver:
         goal = task.goal(pose)
         noise = self._noise if np.hypot(ahead, left) < _CALM_DISTANCE * goal.offset else _FAR_NOISE
         if self._random_state.uniform() < noise:
-            return random_action(self._environment.action_spec(), self._random_state)
-        return self._steer(ahead, left, goal.distance)
+            action = random_action(self._environment.action_spec(), self._random_state)
+            step = task.robot.velocities(action)[0] * task.control_timestep
+            if not self._is_stuck_at(ahead - step, left, goal):
+                return action
+        return self._steer(ahead, left, goal)
 
-    def _steer(self, ahead: float, left: float, distance: float) -> Any:
+    def _is_stuck_at(self, ahead: float, left: float, goal: Goal) -> bool:
+        # Too close, and unable to back up.
+        return bool(np.hypot(ahead, left) < goal.nearest and not self._environment.task.robot.reverse_speed)
+
+    def _steer(self, ahead: float, left: float, goal: Goal) -> Any:
         task = self._environment.task
+        if self._is_stuck_at(ahead, left, goal):
+            return task.robot.action_for(task.robot.max_speed, 0.0)
         bearing = np.arctan2(left, ahead)
-        gap = np.hypot(ahead, left) - 0.9 * distance
+        gap = np.hypot(ahead, left) - 0.9 * goal.distance
         speed = gap / task.control_timestep if abs(bearing) < 0.5 else 0.0
         return task.robot.action_for(speed, bearing / task.control_timestep)
 

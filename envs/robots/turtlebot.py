@@ -46,14 +46,17 @@ _SINK = 3e-5
 _BUMPER = {"condim": 3, "friction": [0.2, 0.005, 0.0001]}
 """The base touches with a little friction: stalled wheels would let it pivot freely at what it runs into."""
 
-FORWARD, LEFT, RIGHT, BACKWARD = range(4)
+FORWARD, LEFT, RIGHT, CREEP = range(4)
 """The actions that ``MOTIONS`` defines."""
+BACKWARD = CREEP
+"""The action that replaces creeping in a robot with a reverse gear, see :func:`motions_for`."""
 
-MOTIONS = ((0.4, 0.0), (0.0, np.deg2rad(48.0)), (0.0, -np.deg2rad(48.0)), (-0.4, 0.0))
-"""Forward speed [m/s] and turn rate [rad/s] of each action: in 0.25 s, 0.1 m or 12 degrees.
+MOTIONS = ((0.4, 0.0), (0.0, np.deg2rad(48.0)), (0.0, -np.deg2rad(48.0)), (0.16, 0.0))
+"""Forward speed [m/s] and turn rate [rad/s] of each action: in 0.25 s, 0.1 m, 12 degrees, or 0.04 m.
 
 The paper's network for the TurtleBot has four outputs (Sahni et al., NeurIPS 2019, appendix). The fourth is taken to be
-backward here: a robot that came too close needs it.
+a slow forward motion here, for the last steps to a goal. It is not backward: a robot that sees only what is ahead would
+back through goals that hindsight puts behind it.
 """
 
 
@@ -65,7 +68,8 @@ class TurtleBot(SightedRobot):
     in it. The camera sits in front of the poles and looks over the base: the robot never sees itself.
 
     Args:
-        motions: Forward speed [m/s] and turn rate (positive is left) [rad/s] of each action, by default ``MOTIONS``.
+        motions: Forward speed [m/s] and turn rate (positive is left) [rad/s] of each action, by default ``MOTIONS``;
+            see :func:`motions_for` for a reverse gear.
         camera_height: [m].
         camera_pitch: How far the camera looks down [rad].
         field_of_view: Vertical [rad].
@@ -209,6 +213,23 @@ class TurtleBot(SightedRobot):
         physics.data.ptr.qpos[self._qpos] = x, y, -_SINK, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)
         physics.data.ptr.qpos[self._wheels] = 0.0
         physics.data.ptr.qvel[self._dofs] = 0.0
+
+
+def motions_for(reverse_speed: float = 0.0) -> tuple[tuple[float, float], ...]:
+    """``MOTIONS``, or for a robot with a reverse gear the same with backward in place of creeping.
+
+    Args:
+        reverse_speed: Of the reverse gear [m/s]; 0: none.
+
+    Raises:
+        ValueError: if it is negative.
+
+    >>> motions_for(0.3)[BACKWARD]
+    (-0.3, 0.0)
+    """
+    if not reverse_speed >= 0:
+        raise ValueError(f"reverse_speed must not be negative; got {reverse_speed} m/s.")
+    return (*MOTIONS[:BACKWARD], (-reverse_speed, 0.0)) if reverse_speed else MOTIONS
 
 
 def wheel_speeds(speed: float, turn_rate: float) -> np.ndarray:

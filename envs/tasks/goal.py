@@ -16,15 +16,15 @@ class Goal:
     """A prop that is reached when the robot is close to it and has it straight ahead.
 
     Attributes:
-        box: The prop, a box or whatever else has a ``size`` and a ``radius`` [m].
-        distance: Close is at most this far, between the centres of robot and box [m].
+        prop: What is to be reached; has a ``size`` and a ``radius`` [m].
+        distance: Close is at most this far, between the centres of robot and prop [m].
         tolerance: Straight ahead is at most this far beside the optical axis [m].
         nearest: Closer than this the robot's camera loses it, and it is not reached [m].
         overshoot: How much closer than ``distance`` a robot is when it has reached it, on average over scripted
             rollouts [m].
     """
 
-    box: MocapProp
+    prop: MocapProp
     distance: float
     tolerance: float
     nearest: float = 0.0
@@ -32,11 +32,11 @@ class Goal:
 
     @property
     def offset(self) -> float:
-        """How far ahead of the robot the box stands when it is reached, on average over scripted rollouts [m]."""
+        """How far ahead of the robot the prop stands when it is reached, on average over scripted rollouts [m]."""
         return self.distance - self.overshoot
 
     def is_reached(self, pose: np.ndarray, position: np.ndarray) -> bool:
-        """Whether a robot at pose [P] has reached the box at position [2]."""
+        """Whether a robot at pose [P] has reached the prop at position [2]."""
         ahead, left = in_robot_frame(pose, position)
         close = self.nearest <= np.hypot(ahead, left) <= self.distance
         return bool(close and ahead > 0 and abs(left) <= self.tolerance)
@@ -52,10 +52,10 @@ class Goal:
         Raises:
             ValueError: if the robot cannot come so close, or the tolerance is not positive.
         """
-        nearest = robot_radius + self.box.size / 2
+        nearest = robot_radius + self.prop.size / 2
         if not self.distance > nearest:
             raise ValueError(
-                f"{distance_name}={self.distance} m cannot be reached: robot and box touch at {nearest:.3f} m; "
+                f"{distance_name}={self.distance} m cannot be reached: robot and goal touch at {nearest:.3f} m; "
                 "use a larger one."
             )
         if not self.tolerance > 0:

@@ -1,5 +1,6 @@
 """GoalTask: what all tasks share in which a robot in a room must find goals by sight."""
 
+import math
 from collections.abc import Mapping
 from itertools import combinations, product
 from typing import Any
@@ -36,7 +37,8 @@ class GoalTask(composer.Task):
         robot: The robot, e.g. ``envs.robots.rover.Rover``.
         arena: The room; robot and boxes are attached to it.
         goals: The goals, each by the name under which :meth:`fix_start` knows its box.
-        min_start_distance: Between the robot and each box at the start of an episode [m].
+        min_start_distance: At least so far are the robot and each box apart at the start of an episode [m].
+        max_start_distance: At most so far [m]; for goals that are seen from close by only.
         min_box_distance: Between any two boxes at the start of an episode [m].
         energy_cost: Subtracted from the reward for each unit of the Euclidean norm of speed and turn rate, in units of
             the robot's largest ones, each step.
@@ -45,7 +47,8 @@ class GoalTask(composer.Task):
         physics_timestep: Seconds a physics substep.
 
     Raises:
-        ValueError: if the room is too small for the start distances, or they are so small that episodes start solved.
+        ValueError: if the room is too small for the start distances, they are out of order, or episodes would start
+            solved.
     """
 
     mission: str
@@ -62,6 +65,7 @@ class GoalTask(composer.Task):
         goals: Mapping[str, Goal],
         *,
         min_start_distance: float,
+        max_start_distance: float = math.inf,
         min_box_distance: float = 0.0,
         energy_cost: float = 0.0025,
         success_reward: float = 1.0,
@@ -72,6 +76,7 @@ class GoalTask(composer.Task):
         self.arena = arena
         self.goals = dict(goals)
         self.min_start_distance = min_start_distance
+        self.max_start_distance = max_start_distance
         self.min_box_distance = min_box_distance
         self.energy_cost = energy_cost
         self.success_reward = success_reward
@@ -86,7 +91,7 @@ class GoalTask(composer.Task):
     def _attach(self) -> None:
         self.robot.attach_to(self.arena)
         for goal in self.goals.values():
-            self.arena.attach_mocap(goal.box)
+            self.arena.attach_mocap(goal.prop)
 
     def _make_observables(self) -> dict[str, KnownSpec]:
         pixels = specs.BoundedArray((*self.robot.image_size, 3), np.uint8, 0, 255, name="pixels")
@@ -104,6 +109,11 @@ class GoalTask(composer.Task):
             raise ValueError(
                 f"min_start_distance={self.min_start_distance} m must exceed {reached} m, from where a goal counts as "
                 "reached, or episodes start solved."
+            )
+        if not self.max_start_distance > self.min_start_distance:
+            raise ValueError(
+                f"max_start_distance={self.max_start_distance} m must exceed "
+                f"min_start_distance={self.min_start_distance} m, or there is no start between them."
             )
         robot_range, box_range = self._robot_range, self._box_range
         widest = {
@@ -167,7 +177,7 @@ class GoalTask(composer.Task):
 
     def goal_position(self, physics: Any) -> np.ndarray:
         """Where the goal stands that is pursued at present, x, y [m]; privileged: no agent may ask."""
-        return self.goal(self.pose(physics)).box.position(physics)
+        return self.goal(self.pose(physics)).prop.position(physics)
 
     def is_success(self, pose: np.ndarray, position: np.ndarray) -> bool:
         """Whether a robot at pose [P] has reached the goal it pursues, if that stands at position [2]."""
@@ -185,16 +195,16 @@ class GoalTask(composer.Task):
         """
         self.robot.set_pose(physics, pose[:3])
         for goal in self.goals.values():
-            goal.box.set_position(physics, _OUT_OF_SIGHT)
+            goal.prop.set_position(physics, _OUT_OF_SIGHT)
         if goal_position is not None:
-            self.goal(pose).box.set_position(physics, goal_position)
+            self.goal(pose).prop.set_position(physics, goal_position)
 
     def initialize_episode(self, physics: Any, random_state: np.random.RandomState) -> None:
         """Places robot and boxes where :meth:`fix_start` says, else at random."""
         start = self.draw_start(random_state, self._fixed)
         self.robot.set_pose(physics, start["pose"])
         for name, goal in self.goals.items():
-            goal.box.set_position(physics, start[name])
+            goal.prop.set_position(physics, start[name])
         self._succeeded = False
         self._energy = 0.0
 
@@ -217,7 +227,7 @@ class GoalTask(composer.Task):
     def _check_start(self, fixed: Mapping[str, np.ndarray]) -> None:
         self._check_in_room("pose", fixed, self.robot.radius)
         for name, goal in self.goals.items():
-            self._check_in_room(name, fixed, goal.box.size / 2)
+            self._check_in_room(name, fixed, goal.prop.size / 2)
             self._check_robot_apart(name, fixed)
         for one, other in combinations(self.goals, 2):
             self._check_boxes_apart(one, other, fixed)
@@ -236,18 +246,18 @@ class GoalTask(composer.Task):
     def _check_robot_apart(self, name: str, fixed: Mapping[str, np.ndarray]) -> None:
         if not {"pose", name} <= fixed.keys():
             return
-        box, pose, position = self.goals[name].box, fixed["pose"], fixed[name]
-        gap = np.hypot(*np.maximum(np.abs(pose[:2] - position) - box.size / 2, 0)) - self.robot.radius
+        prop, pose, position = self.goals[name].prop, fixed["pose"], fixed[name]
+        gap = np.hypot(*np.maximum(np.abs(pose[:2] - position) - prop.size / 2, 0)) - self.robot.radius
         if gap < 0:
             raise ValueError(
                 f"pose={pose.tolist()} and {name}={position.tolist()} overlap by {-gap:.3f} m: move them apart, "
-                f"{self.robot.radius + box.radius:.3f} m between the centres are always enough."
+                f"{self.robot.radius + prop.radius:.3f} m between the centres are always enough."
             )
 
     def _check_boxes_apart(self, one: str, other: str, fixed: Mapping[str, np.ndarray]) -> None:
         if not {one, other} <= fixed.keys():
             return
-        nearest = (self.goals[one].box.size + self.goals[other].box.size) / 2
+        nearest = (self.goals[one].prop.size + self.goals[other].prop.size) / 2
         if np.abs(fixed[one] - fixed[other]).max() < nearest:
             raise ValueError(
                 f"{one}={fixed[one].tolist()} and {other}={fixed[other].tolist()} overlap: move them apart, "
@@ -257,7 +267,7 @@ class GoalTask(composer.Task):
     def draw_start(
         self, random_state: np.random.RandomState, fixed: Mapping[str, np.ndarray] | None = None
     ) -> dict[str, np.ndarray]:
-        """Draws where things are, uniformly among what is far enough apart.
+        """Draws where things are, uniformly among what is as far apart as it must be.
 
         Args:
             random_state: Source of what is drawn.
@@ -276,18 +286,21 @@ class GoalTask(composer.Task):
                 name: fixed[name][:2] if name in fixed else random_state.uniform(-widest, widest, size=2)
                 for name, widest in ranges.items()
             }
-            if self._far_apart(start, fixed):
+            if self._apart(start, fixed):
                 yaw = fixed["pose"][2] if "pose" in fixed else random_state.uniform(-np.pi, np.pi)
                 return start | {"pose": np.array([*start["pose"], yaw])}
         raise composer.EpisodeInitializationError(
-            f"No start with robot and box {self.min_start_distance} m apart, and boxes {self.min_box_distance} m from "
-            f"each other, in {_MAX_DRAWS} draws: use a larger place or smaller distances."
+            f"No start with robot and goal {self.min_start_distance} to {self.max_start_distance} m apart, and goals "
+            f"{self.min_box_distance} m from each other, in {_MAX_DRAWS} draws: use a larger place or other distances."
         )
 
-    def _far_apart(self, start: Mapping[str, np.ndarray], fixed: Mapping[str, np.ndarray]) -> bool:
+    def _apart(self, start: Mapping[str, np.ndarray], fixed: Mapping[str, np.ndarray]) -> bool:
         for one, other in combinations(start, 2):
-            nearest = self.min_start_distance if one == "pose" else self.min_box_distance
-            if not {one, other} <= fixed.keys() and np.hypot(*(start[one] - start[other])) < nearest:
+            nearest, farthest = self.min_box_distance, math.inf
+            if one == "pose":
+                nearest, farthest = self.min_start_distance, self.max_start_distance
+            is_fixed = {one, other} <= fixed.keys()
+            if not is_fixed and not nearest <= np.hypot(*(start[one] - start[other])) <= farthest:
                 return False
         return True
 

@@ -19,7 +19,8 @@ class FindPebble(SingleGoalTask):
         robot: The robot.
         arena: The road; robot and pebble are attached to it.
         pebble: The goal; starts call it ``pebble``.
-        min_start_distance: Between robot and pebble at the start of an episode [m].
+        min_start_distance: At least so far are robot and pebble apart at the start of an episode [m].
+        max_start_distance: At most so far [m]; by default from where a robot that faces the pebble sees it well.
         success_distance: [m].
         nearest: Closer than this the pebble is out of the image, or about to be [m].
         centring_tolerance: [m].
@@ -28,7 +29,7 @@ class FindPebble(SingleGoalTask):
         physics_timestep: Seconds a physics substep.
 
     Raises:
-        ValueError: if a length is not positive, or the road is too small for the start distance.
+        ValueError: if a length is not positive, start distances are out of order, or the road is too small for them.
     """
 
     mission = "Drive up to the pebble"
@@ -40,6 +41,7 @@ class FindPebble(SingleGoalTask):
         pebble: Pebble,
         *,
         min_start_distance: float = 0.6,
+        max_start_distance: float = 1.5,
         success_distance: float = 0.45,
         nearest: float = 0.34,
         centring_tolerance: float = 0.05,
@@ -65,6 +67,7 @@ class FindPebble(SingleGoalTask):
             "pebble",
             goal,
             min_start_distance=min_start_distance,
+            max_start_distance=max_start_distance,
             energy_cost=energy_cost,
             control_timestep=control_timestep,
             physics_timestep=physics_timestep,

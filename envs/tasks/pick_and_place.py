@@ -103,7 +103,7 @@ class PickAndPlace(GoalTask):
     def _carry(self, physics: Any, pose: np.ndarray) -> None:
         x, y, yaw = pose[:3]
         ahead = self._carry_ahead * np.array([np.cos(yaw), np.sin(yaw)])
-        self._red.box.set_position(physics, np.array([x, y]) + ahead, yaw=yaw, height=self._carry_height)
+        self._red.prop.set_position(physics, np.array([x, y]) + ahead, yaw=yaw, height=self._carry_height)
 
     def _check_start(self, fixed: Mapping[str, np.ndarray]) -> None:
         super()._check_start(fixed)
@@ -117,7 +117,7 @@ class PickAndPlace(GoalTask):
         """Places robot and boxes where :meth:`fix_start` says, else at random."""
         super().initialize_episode(physics, random_state)
         self._held = bool(self._fixed.get("held", False))
-        self._red.box.set_solid(physics, not self._held)
+        self._red.prop.set_solid(physics, not self._held)
         if self._held:
             self._carry(physics, self.pose(physics))
 
@@ -129,7 +129,7 @@ class PickAndPlace(GoalTask):
         self._succeeded = reached and self._held
         if reached and not self._held:
             self._held = True
-            self._red.box.set_solid(physics, False)
+            self._red.prop.set_solid(physics, False)
         if self._held:
             self._carry(physics, pose)
             mujoco.mj_kinematics(physics.model.ptr, physics.data.ptr)  # Or the camera saw it a step behind.

@@ -1,5 +1,6 @@
 """SingleGoalTask: what tasks share in which there is one thing to find."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -17,19 +18,35 @@ class SingleGoalTask(GoalTask):
         arena: The place; robot and goal are attached to it.
         name: Under which starts know the goal.
         goal: The goal.
-        min_start_distance: Between robot and goal at the start of an episode [m].
+        min_start_distance: At least so far are robot and goal apart at the start of an episode [m].
+        max_start_distance: At most so far [m].
         kwargs: Costs, rewards and timesteps, see :class:`GoalTask`.
 
     Raises:
-        ValueError: if a length is not positive, or the arena is too small for the start distance.
+        ValueError: if a length is not positive, start distances are out of order, or the arena is too small for them.
     """
 
     def __init__(
-        self, robot: Any, arena: Arena, name: str, goal: Goal, *, min_start_distance: float, **kwargs: float
+        self,
+        robot: Any,
+        arena: Arena,
+        name: str,
+        goal: Goal,
+        *,
+        min_start_distance: float,
+        max_start_distance: float = math.inf,
+        **kwargs: float,
     ) -> None:
         self._goal = goal
         goal.check(robot.radius, distance_name="success_distance", tolerance_name="centring_tolerance")
-        super().__init__(robot, arena, {name: goal}, min_start_distance=min_start_distance, **kwargs)
+        super().__init__(
+            robot,
+            arena,
+            {name: goal},
+            min_start_distance=min_start_distance,
+            max_start_distance=max_start_distance,
+            **kwargs,
+        )
 
     def goal(self, pose: np.ndarray) -> Goal:
         """The only one, wherever the robot is."""

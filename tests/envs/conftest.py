@@ -17,7 +17,7 @@ class Stage:
         self.environment = environment
         self.task = environment.task
         self.robot = environment.task.robot
-        self.box = environment.task.goals["box"].box
+        self.box = environment.task.goals["box"].prop
 
     @property
     def physics(self) -> Any:

@@ -12,7 +12,7 @@ from matplotlib.backend_bases import KeyEvent
 import envs
 from envs import drive
 from envs.robots.rover import Rover
-from envs.robots.turtlebot import BACKWARD, FORWARD, LEFT, RIGHT, TurtleBot
+from envs.robots.turtlebot import BACKWARD, FORWARD, LEFT, RIGHT, TurtleBot, motions_for
 
 
 def held(*names):
@@ -43,7 +43,7 @@ def test_the_arrows_that_are_held_say_where_to_drive(names, speed, turn_rate):
     ("names", "motion"), [(("up",), FORWARD), (("down",), BACKWARD), (("left",), LEFT), (("right",), RIGHT)]
 )
 def test_the_arrows_choose_among_discrete_actions(names, motion):
-    assert held(*names).action(TurtleBot()) == motion
+    assert held(*names).action(TurtleBot(motions=motions_for(0.4))) == motion
 
 
 def test_a_robot_that_cannot_stand_still_waits_for_a_key():
@@ -61,6 +61,10 @@ def test_a_robot_that_cannot_stand_still_waits_for_a_key():
 
 def test_a_robot_without_reverse_gear_stands_still_on_down():
     assert Rover().velocities(held("down").action(Rover())) == (0.0, 0.0)
+
+
+def test_one_that_can_neither_reverse_nor_stand_still_waits_on_down():
+    assert held("down").action(TurtleBot()) is None
 
 
 def test_a_released_key_drives_no_more():

@@ -22,7 +22,7 @@ def env():
 
 def box_of(env):
     environment = env.unwrapped.environment
-    return environment.task.goals["box"].box.position(environment.physics)
+    return environment.task.goals["box"].prop.position(environment.physics)
 
 
 @pytest.mark.parametrize("name", sorted(envs.NAMES))

@@ -67,7 +67,7 @@ def test_starts_are_far_apart_free_and_reachable(named_environment):
         for name, goal in task.goals.items():
             assert np.hypot(*(pose[:2] - start[name])) >= nearest
             # Room for the robot between box and wall.
-            assert (np.abs(start[name]) <= half - goal.box.radius - 2 * task.robot.radius).all()
+            assert (np.abs(start[name]) <= half - goal.prop.radius - 2 * task.robot.radius).all()
 
 
 def test_episodes_start_without_contact_but_for_wheels_on_the_ground(named_environment):

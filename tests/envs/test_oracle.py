@@ -17,7 +17,7 @@ def test_it_renders_what_the_environment_shows(renderer, room_2m):
         room_2m.reset()
         for _ in range(3):
             observation = room_2m.step(np.array([0.7, -0.4])).observation
-        box = room_2m.task.goals["box"].box.position(room_2m.physics)
+        box = room_2m.task.goals["box"].prop.position(room_2m.physics)
         frame = renderer.render(room_2m.task.robot.pose(room_2m.physics), box)
         np.testing.assert_array_equal(frame, observation["pixels"])
 

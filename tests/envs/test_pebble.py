@@ -2,13 +2,14 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from dm_control.composer import EpisodeInitializationError
 
 import envs
 from envs.arenas.arena import WALL_GROUP
 from envs.arenas.road import Road
-from envs.near_goal import collect_failed, collect_near_goal
+from envs.near_goal import NoisyDriver, collect_failed, collect_near_goal
 from envs.props.pebble import Pebble
-from envs.robots.turtlebot import BACKWARD, BODY_GROUP, FORWARD, LEFT, RIGHT, TurtleBot
+from envs.robots.turtlebot import BACKWARD, BODY_GROUP, CREEP, FORWARD, LEFT, RIGHT, TurtleBot
 from envs.tasks.pebble import FindPebble
 from envs.transition import read
 
@@ -75,9 +76,49 @@ def test_turning_towards_the_pebble_succeeds_and_away_does_not(road):
         assert step(road, turn).terminated is succeeds
 
 
-def test_one_that_is_too_close_backs_up_to_success(road):
-    start(road, (0.0, 0.0, 0.0), pebble=(0.28, 0.0))
-    assert step(road, BACKWARD).terminated
+def test_creeping_up_to_the_pebble_succeeds(road):
+    start(road, (0.0, 0.0, 0.0), pebble=(0.47, 0.0))
+    assert step(road, CREEP).terminated
+
+
+@pytest.fixture(scope="module")
+def reversing_road():
+    environment = envs.find_pebble(random_state=0, reverse_speed=0.4)
+    yield environment
+    environment.close()
+
+
+def test_one_that_is_too_close_backs_up_to_success_if_it_has_a_reverse_gear(reversing_road):
+    start(reversing_road, (0.0, 0.0, 0.0), pebble=(0.28, 0.0))
+    assert step(reversing_road, BACKWARD).terminated
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_episodes_start_0_6_to_1_5_m_from_the_pebble(road, seed):
+    random_state = np.random.RandomState(seed)
+    starts = [road.task.draw_start(random_state) for _ in range(2000)]
+    distances = [np.hypot(*(drawn["pose"][:2] - drawn["pebble"])) for drawn in starts]
+    assert 0.6 <= min(distances) < 0.65
+    assert 1.45 < max(distances) <= 1.5
+
+
+@pytest.mark.parametrize("fixed", [{"pose": (2.8, 1.3, 0.0)}, {"pebble": (2.97, 1.47)}, {"pose": (0.0, 0.0, 0.0)}])
+def test_what_is_not_fixed_is_drawn_within_reach_even_in_a_corner(road, fixed):
+    (name, place), random_state = *fixed.items(), np.random.RandomState(0)
+    for _ in range(300):
+        drawn = road.task.draw_start(random_state, {name: np.array(place)})
+        assert np.array_equal(drawn[name], place)
+        assert 0.6 <= np.hypot(*(drawn["pose"][:2] - drawn["pebble"])) <= 1.5
+
+
+def test_a_fixed_start_may_be_farther_from_the_pebble(road):
+    assert start(road, (-2.0, 0.0, 0.0), pebble=(2.0, 0.0)).pose[0] == pytest.approx(-2.0)
+
+
+def test_start_distances_that_are_never_drawn_are_reported():
+    task = make_task(max_start_distance=np.nextafter(0.6, 1.0))
+    with pytest.raises(EpisodeInitializationError, match=r"robot and goal 0.6 to 0.60.* m apart.*in 10000 draws"):
+        task.draw_start(np.random.RandomState(0))
 
 
 def test_the_pebble_does_not_block(road):
@@ -190,6 +231,8 @@ def test_impossible_starts_are_refused(road, options, message):
         ({"nearest": 0.5}, "nearest=0.5 m must lie between 0 and success_distance=0.45 m"),
         ({"nearest": -0.1}, "nearest=-0.1 m"),
         ({"min_start_distance": 0.4}, "min_start_distance=0.4 m must exceed 0.45 m"),
+        ({"max_start_distance": 0.6}, "max_start_distance=0.6 m must exceed min_start_distance=0.6 m"),
+        ({"max_start_distance": float("nan")}, "max_start_distance=nan m"),
         ({"success_distance": 0.2, "nearest": 0.1}, "success_distance=0.2 m cannot be reached"),
         ({"width": 1.0}, "A road of 6.0 m x 1.0 m is too small"),
         ({"length": -1.0}, "must be positive; got -1.0 m and 3.0 m"),
@@ -260,6 +303,52 @@ def near_goal():
     snapshots = collect_near_goal(environment, 120, np.random.RandomState(2), steps_before_goal=16)
     environment.close()
     return snapshots
+
+
+def drive(environment, pose, pebble, steps):
+    """Whether the scripted driver reaches the pebble, and after how many steps."""
+    driver = NoisyDriver(environment, np.random.RandomState(0), noise=(0.0, 0.0))
+    state = start(environment, pose, pebble)
+    for count in range(1, steps + 1):
+        state = step(environment, driver.act(state.pose))
+        if state.terminated:
+            return True, count
+    return False, steps
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.4, -1.6, 3.0])
+def test_the_driver_goes_round_when_it_is_too_close(road, yaw):
+    reached, count = drive(road, (0.0, 0.0, yaw), pebble=(0.3, 0.05), steps=40)
+    assert reached
+    assert count > 5
+
+
+def test_the_driver_goes_round_even_before_a_kerb(road):
+    assert drive(road, (0.2, 1.2, 1.5), pebble=(0.2, 0.87), steps=40)[0]
+
+
+def noisiest_actions(environment, ahead):
+    driver = NoisyDriver(environment, np.random.RandomState(0), noise=(1.0, 1.0))
+    pose = start(environment, (0.0, 0.0, 0.0), pebble=(ahead, 0.08)).pose
+    return {driver.act(pose) for _ in range(100)}
+
+
+def test_the_noisiest_driver_does_not_come_too_close(road):
+    assert noisiest_actions(road, 0.5) == {FORWARD, LEFT, RIGHT, CREEP}
+    assert noisiest_actions(road, 0.4) == {LEFT, RIGHT, CREEP}
+    assert noisiest_actions(road, 0.36) == {LEFT, RIGHT}
+
+
+def test_the_noisiest_driver_drives_on_when_it_is_too_close(road):
+    assert noisiest_actions(road, 0.3) == {FORWARD}
+
+
+def test_the_noisiest_driver_may_come_too_close_if_it_has_a_reverse_gear(reversing_road):
+    assert noisiest_actions(reversing_road, 0.3) == {FORWARD, LEFT, RIGHT, BACKWARD}
+
+
+def test_the_driver_backs_up_when_it_is_too_close_and_can(reversing_road):
+    assert drive(reversing_road, (0.0, 0.0, 0.0), pebble=(0.3, 0.0), steps=40) == (True, 1)
 
 
 def test_near_goal_frames_end_at_the_pebble(near_goal, road):

@@ -46,7 +46,7 @@ def held(timesteps):
 
 
 def box_position(environment, name):
-    return environment.task.goals[name].box.position(environment.physics)
+    return environment.task.goals[name].prop.position(environment.physics)
 
 
 def red(image):
@@ -220,6 +220,13 @@ def test_drawn_starts_are_apart_from_each_other_and_from_the_walls(environment):
     assert 0.7 < np.abs([red_box, green_box]).max() <= 1 - 0.16 - 0.05
 
 
+def test_no_box_starts_farther_from_the_robot_than_asked_for():
+    task, random_state = make_task(max_start_distance=0.9), np.random.RandomState(0)
+    starts = [task.draw_start(random_state) for _ in range(500)]
+    farthest = {name: max(np.hypot(*(drawn["pose"][:2] - drawn[name])) for drawn in starts) for name in task.goals}
+    assert all(0.85 < distance <= 0.9 for distance in farthest.values())
+
+
 def test_equal_seeds_give_equal_episodes():
     first, again, other = (run_episode(seed) for seed in (7, 7, 8))
     for one, same in zip(first, again, strict=True):
@@ -281,8 +288,8 @@ def test_impossible_starts_are_refused_and_the_episode_goes_on(environment, star
         ({"min_box_distance": float("nan")}, "min_box_distance=nan"),
         ({"min_start_distance": 0.15}, "min_start_distance=0.15 m must exceed 0.16 m"),
         ({"min_box_distance": 0.29}, r"min_box_distance=0.29 m must exceed .* = 0.29 m, or the pick-up may deliver"),
-        ({"pick_up_distance": 0.07}, "pick_up_distance=0.07 m cannot be reached: robot and box touch at 0.070 m"),
-        ({"delivery_distance": 0.08}, "delivery_distance=0.08 m cannot be reached: robot and box touch at 0.090 m"),
+        ({"pick_up_distance": 0.07}, "pick_up_distance=0.07 m cannot be reached: robot and goal touch at 0.070 m"),
+        ({"delivery_distance": 0.08}, "delivery_distance=0.08 m cannot be reached: robot and goal touch at 0.090 m"),
         ({"pick_up_tolerance": 0.0}, "pick_up_tolerance must be positive; got 0.0 m"),
         ({"delivery_tolerance": -0.1}, "delivery_tolerance must be positive; got -0.1 m"),
         ({"carry_height": -0.01}, "carry_height must not be negative; got -0.01 m"),

@@ -30,7 +30,7 @@ def pebble_env():
 def place(env, pose, box):
     env.reset()
     env.robot.set_pose(env.environment.physics, np.array(pose))
-    env.environment.task.goals["box"].box.set_position(env.environment.physics, np.array(box))
+    env.environment.task.goals["box"].prop.set_position(env.environment.physics, np.array(box))
     env.environment.physics.forward()
 
 
@@ -110,7 +110,7 @@ def test_discrete_actions_that_are_not_one_hot_are_refused(pebble_env, action):
         pebble_env.step(TensorDict({"action": torch.tensor(action)}, []))
 
 
-@pytest.mark.parametrize(("motion", "moved"), [(0, 0.1), (3, -0.1)])
+@pytest.mark.parametrize(("motion", "moved"), [(0, 0.1), (3, 0.04)])
 def test_the_place_of_the_one_tells_the_motion(pebble_env, motion, moved):
     action = TensorDict({"action": torch.eye(4, dtype=torch.int64)[motion]}, [])
     pebble_env.environment.reset_to({"pose": (0.0, 0.3, 0.0), "pebble": (2.0, -0.5)})

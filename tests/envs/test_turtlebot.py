@@ -6,6 +6,7 @@ import envs
 from envs.robots.turtlebot import (
     BACKWARD,
     BODY_GROUP,
+    CREEP,
     FORWARD,
     LEFT,
     MOTIONS,
@@ -13,6 +14,7 @@ from envs.robots.turtlebot import (
     WHEEL_BASE,
     WHEEL_RADIUS,
     TurtleBot,
+    motions_for,
     wheel_speeds,
 )
 
@@ -75,10 +77,36 @@ def test_a_turn_is_12_degrees_on_the_spot(road, action, degrees):
     np.testing.assert_allclose(after[:2], [0.4, -0.2], atol=1e-3)
 
 
-def test_a_step_backward_is_10_cm_without_turning(road):
+def test_a_step_of_creeping_is_4_cm_without_turning(road):
     place(road, 1.0, 0.5, 0.0)
-    *_, last, after = poses(road, *[BACKWARD] * 3)
-    np.testing.assert_allclose(after - last, [-0.1, 0.0, 0.0], atol=1e-3)
+    *_, last, after = poses(road, *[CREEP] * 3)
+    np.testing.assert_allclose(after - last, [0.04, 0.0, 0.0], atol=1e-3)
+
+
+def test_with_a_reverse_gear_the_fourth_action_drives_backward():
+    environment = envs.find_pebble(random_state=0, reverse_speed=0.3)
+    environment.reset()
+    place(environment, 1.0, 0.5, 0.0)
+    *_, last, after = poses(environment, *[BACKWARD] * 3)
+    environment.close()
+    np.testing.assert_allclose(after - last, [-0.075, 0.0, 0.0], atol=1e-3)
+
+
+def test_by_default_no_action_drives_backward():
+    assert all(speed >= 0 for speed, _ in MOTIONS)
+    assert TurtleBot().reverse_speed == 0.0
+
+
+def test_a_reverse_gear_replaces_creeping_only():
+    robot = TurtleBot(motions=motions_for(0.3))
+    assert [robot.velocities(action) for action in range(4)] == [*MOTIONS[:3], (-0.3, 0.0)]
+    assert robot.reverse_speed == 0.3
+
+
+@pytest.mark.parametrize("reverse_speed", [-0.1, float("nan")])
+def test_a_reverse_speed_that_is_no_speed_is_refused(reverse_speed):
+    with pytest.raises(ValueError, match=f"reverse_speed must not be negative; got {reverse_speed} m/s"):
+        motions_for(reverse_speed)
 
 
 def test_it_moves_as_far_as_its_wheels_roll(road):
@@ -174,10 +202,15 @@ def test_the_action_for_a_motion_is_that_motion(action):
 
 
 @pytest.mark.parametrize(
-    ("speed", "turn_rate", "action"), [(0.3, 0.4, FORWARD), (0.1, 0.4, LEFT), (9.0, -0.1, FORWARD), (-0.3, 0, BACKWARD)]
+    ("speed", "turn_rate", "action"),
+    [(0.3, 0.4, FORWARD), (0.1, 0.7, LEFT), (9.0, -0.1, FORWARD), (0.1, 0.1, CREEP), (-0.3, 0.0, CREEP)],
 )
 def test_the_action_for_any_other_motion_is_the_nearest(speed, turn_rate, action):
     assert TurtleBot().action_for(speed, turn_rate) == action
+
+
+def test_the_action_for_a_motion_backward_is_backward_where_there_is_a_reverse_gear():
+    assert TurtleBot(motions=motions_for(0.4)).action_for(-0.3, 0.0) == BACKWARD
 
 
 def test_actions_are_as_many_as_motions():
