@@ -35,7 +35,7 @@ def navigate_4m(
 def navigate_2m(
     random_state: int | np.random.RandomState | None = None, time_limit: float = 20.0, reverse_speed: float = 0.0
 ) -> Environment:
-    """Half the room and half the start distance, 2 m and 0.5 m, and a tolerance of 2 cm: learned in minutes.
+    """Half the room and half the start distance, 2 m and 0.5 m: learned in minutes.
 
     Args:
         random_state: Seed or generator of the starts.
@@ -50,6 +50,6 @@ def navigate_2m(
     arena = WalledRoom(size=2.0)
 
     # A task that rewards success only.
-    task = Navigate(robot, arena, goal_box, min_start_distance=0.5, centring_tolerance=0.02)
+    task = Navigate(robot, arena, goal_box, min_start_distance=0.5, centring_tolerance=0.01)
 
     return Environment(task, time_limit=time_limit, random_state=random_state)

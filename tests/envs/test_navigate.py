@@ -102,7 +102,7 @@ def test_the_rooms_have_the_paper_s_size_and_the_small_one():
         environment.close()
     assert sizes == {
         "navigate-4m": (4.0, 4.0, 0.01),
-        "navigate-2m": (2.0, 2.0, 0.02),
+        "navigate-2m": (2.0, 2.0, 0.01),
         "pebble": (6.0, 3.0, 0.05),
         "pick-and-place-2m": (2.0, 2.0, 0.02, 0.02),
     }
