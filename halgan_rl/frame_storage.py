@@ -5,7 +5,7 @@ import logging
 import os
 import shutil
 from collections.abc import Sequence
-from functools import reduce
+from functools import partial, reduce
 from multiprocessing.context import get_spawning_popen
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -153,6 +153,7 @@ class FrameStorage(LazyTensorStorage):
         if extra_frames is not None and extra_frames < 0:
             raise ValueError(f"extra_frames must not be negative, got {extra_frames}")
         super().__init__(max_size)
+        self.device = None  # All is in CPU memory: a buffer would only spend a quarter of a sample's time on moving it.
         self.scratch_dir = None if scratch_dir is None else Path(scratch_dir)
         self.extra_frames = min(max(max_size // 10, 64), max_size) if extra_frames is None else extra_frames
         self.pixels_key = pixels_key
@@ -310,10 +311,11 @@ class FrameStorage(LazyTensorStorage):
         _check_room(nbytes, slots * OVERHEAD, self.scratch_dir, remedy)
         if self.scratch_dir is None:
             frames = torch.empty(slots, size, dtype=torch.uint8)
-            self._init(row)
+            empty = partial(torch.empty_like, memory_format=torch.contiguous_format)
+            self._storage = row.expand(self.max_size).apply(empty)
         else:
             self._storage, frames = self._map(row, slots, size, self.scratch_dir)
-            self.initialized = True
+        self.initialized = True
         self.bytes_per_row, self.nbytes = bytes_per_row, nbytes
         self._frame_shape, self._table = shape, FrameTable(frames)
         self._forget_slots()
