@@ -4,7 +4,7 @@ import dataclasses
 
 import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
-from torchrl.data import TensorSpec
+from torchrl.data import Bounded, TensorSpec
 from torchrl.modules import AdditiveGaussianModule, EGreedyModule
 from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
 
@@ -35,7 +35,16 @@ FIGURES = {"pred_value": "q_value", "loss_value": "loss_value", "loss_actor": "l
 
 
 def make_agent(config: DDPGConfig, action_spec: TensorSpec) -> Agent:
-    """Return actor and critic, both on the camera image alone, how the actor explores, and how they learn."""
+    """Return actor and critic, both on the camera image alone, how the actor explores, and how they learn.
+
+    Raises:
+        ValueError: if the environment's actions are discrete.
+    """
+    if not isinstance(action_spec, Bounded):
+        raise ValueError(
+            f"{config.environment} has discrete actions, DDPG needs continuous ones: train it with DDQN "
+            "(halgan_rl.ddqn; recipes/ddqn_pebble.py)"
+        )
     network = Actor(action_spec.shape[-1], downsample=config.downsample, small_output=config.small_output)
     actor = deterministic_policy(network)
     critic = TensorDictModule(

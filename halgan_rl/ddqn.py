@@ -4,7 +4,7 @@ import dataclasses
 
 import torch
 from tensordict.nn import TensorDictSequential
-from torchrl.data import TensorSpec
+from torchrl.data import OneHot, TensorSpec
 from torchrl.modules import EGreedyModule, QValueActor
 from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
 
@@ -23,7 +23,16 @@ class DDQNConfig(HindsightConfig):
 
 
 def make_agent(config: DDQNConfig, action_spec: TensorSpec) -> Agent:
-    """Return a network of action values on the camera image alone, how it explores, and how it learns."""
+    """Return a network of action values on the camera image alone, how it explores, and how it learns.
+
+    Raises:
+        ValueError: if the environment's actions are continuous.
+    """
+    if not isinstance(action_spec, OneHot):
+        raise ValueError(
+            f"{config.environment} has continuous actions, DDQN needs one-hot ones: train it with DDPG "
+            "(halgan_rl.ddpg; recipes/ddpg_navigate.py)"
+        )
     network = QNetwork(action_spec.shape[-1], downsample=config.downsample)
     actor = greedy_policy(network)
     epsilon = EGreedyModule(action_spec, config.epsilon_start, config.epsilon_end, config.epsilon_frames)

@@ -175,6 +175,7 @@ PRESETS = {
 
 def main(config: Config) -> None:
     """Collect frames, train, compare with the truth, and write everything into `config.out`."""
+    envs.named(config.environment)  # refuses an unknown one before the folder is made
     folder = RunFolder(config.out, columns=COLUMNS)
     folder.write_config(dataclasses.asdict(config))
     torch.manual_seed(config.seed)  # initial weights

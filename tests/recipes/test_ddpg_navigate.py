@@ -115,6 +115,18 @@ def test_a_folder_that_holds_a_run_is_refused_first(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["metrics.csv"]
 
 
+def test_an_unknown_environment_is_refused_before_the_folder_is_made(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"'moon'.*navigate-2m"):
+        main(dataclasses.replace(TINY, environment="moon", hindsight="none", out=tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_environment_with_other_actions_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"pebble.*discrete.*ddqn"):
+        main(dataclasses.replace(TINY, environment="pebble", hindsight="none", out=tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+
+
 def test_weights_for_another_room_are_refused_before_the_folder_is_made(tmp_path: Path) -> None:
     other = Path(__file__).parents[2] / "halgan_rl" / "shipped" / "navigate-4m.safetensors"
     with pytest.raises(ValueError, match=r"navigate-4m.*navigate-2m"):

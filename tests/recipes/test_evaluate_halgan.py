@@ -25,7 +25,7 @@ def test_the_shipped_weights_are_near_the_truth(bank: bool, tmp_path: Path, caps
 
 
 def test_nobody_s_painting_is_no_overlap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(evaluate_halgan, "GanHallucinator", lambda generator, rng: lambda pixels, pose, goal: pixels)
+    monkeypatch.setattr(evaluate_halgan, "GanHallucinator", lambda *_, **__: lambda pixels, pose, goal: pixels)
     main(dataclasses.replace(TINY, out=tmp_path / "report"))
     report = json.loads((tmp_path / "report" / "fidelity.json").read_text())
     assert report["mask"]["all"]["overlap"] == 0

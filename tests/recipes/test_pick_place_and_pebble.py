@@ -79,6 +79,13 @@ def test_the_share_of_pick_ups_is_reported(tmp_path: Path) -> None:
     assert read_metrics(tmp_path / "run" / "metrics.csv")["eval/held"] == [0, 0]
 
 
+def test_an_environment_with_other_actions_is_refused(tmp_path: Path) -> None:
+    config = ddqn_pebble.Config(environment="navigate-2m", hindsight="none", out=tmp_path / "run")
+    with pytest.raises(ValueError, match=r"navigate-2m has continuous actions.*ddpg"):
+        ddqn_pebble.main(config)
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize("recipe", [ddpg_pick_place, ddqn_pebble])
 def test_the_paper_is_one_flag_away(recipe: Any) -> None:
     assert parse_config(recipe.PRESETS, [], description=None) == recipe.Config()

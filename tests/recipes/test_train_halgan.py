@@ -93,10 +93,16 @@ def test_a_folder_that_holds_a_run_is_refused_first(tmp_path: Path) -> None:
     assert (tmp_path / "metrics.csv").read_text() == "precious"
 
 
-@pytest.mark.parametrize("args", [["--no-such-flag", "1"], ["--environment", "moon"], ["--preset", "nature"]])
+@pytest.mark.parametrize("args", [["--no-such-flag", "1"], ["--generator", "moon"], ["--preset", "nature"]])
 def test_unknown_flags_and_names_are_refused(args: list[str]) -> None:
     with pytest.raises(SystemExit):
         parse_config(PRESETS, args, description=None)
+
+
+def test_an_unknown_environment_is_refused_with_those_there_are_before_the_folder_is_made(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"'moon'.*navigate-2m"):
+        main(dataclasses.replace(TINY, environment="moon", out=tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
