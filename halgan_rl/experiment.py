@@ -24,7 +24,6 @@ from halgan_rl.evaluation import evaluate, record
 from halgan_rl.frame_storage import FrameStorage
 from halgan_rl.hallucination_bank import BankGrid, HallucinationBank
 from halgan_rl.hallucinators import GanHallucinator, Hallucinator, RandomFlags
-from halgan_rl.models.halgan import HallucinationGenerator
 from halgan_rl.poses import PoseTolerance
 from halgan_rl.run_folder import RunFolder, check_unused, read_metrics, versions
 from halgan_rl.training import COLUMNS, Agent, Schedule, train
@@ -216,8 +215,16 @@ def make_hallucinator(config: HindsightConfig, simulator: Simulator) -> Hallucin
     """Return who paints the goal; weights that do not fit the environment are refused here."""
     if config.hindsight == "none":
         return None
+    rng = torch.Generator().manual_seed(config.seed)
     if config.hindsight == "oracle":
-        return simulator.GoalRenderer(config.environment)
+        painter = simulator.GoalRenderer(config.environment)
+    else:
+        painter = make_painter(config, simulator, rng)
+    return RandomFlags(painter, rng=rng) if config.random_flags else painter
+
+
+def make_painter(config: HindsightConfig, simulator: Simulator, rng: torch.Generator) -> Hallucinator:
+    """Return what paints with a generator: its bank, or the generator itself."""
     path = config.weights or shipped_weights(config.environment)
     generator = load_generator(
         path,
@@ -225,17 +232,8 @@ def make_hallucinator(config: HindsightConfig, simulator: Simulator) -> Hallucin
         pose_size=3 + len(simulator.pose_flags(config.environment)),
         allow_other_mujoco=config.allow_other_mujoco,
     )
-    rng = torch.Generator().manual_seed(config.seed)
-    hallucinator = make_painter(config, generator, simulator.goal_offsets(config.environment), rng)
-    return RandomFlags(hallucinator, rng=rng) if config.random_flags else hallucinator
-
-
-def make_painter(
-    config: HindsightConfig, generator: HallucinationGenerator, goal_offsets: tuple[float, ...], rng: torch.Generator
-) -> Hallucinator:
-    """Return what paints with a generator."""
     if config.bank:
-        grid = BankGrid(goal_offset=goal_offsets)
+        grid = BankGrid(goal_offset=simulator.goal_offsets(config.environment))
         return HallucinationBank(generator, grid, rng=rng, share_latent=config.share_latent)
     return GanHallucinator(generator, rng=rng, share_latent=config.share_latent)
 

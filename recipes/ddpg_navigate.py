@@ -39,7 +39,6 @@ Differences from the paper (Sahni et al., NeurIPS 2019, appendix), all undone by
 10. The shipped generator is this library's (see ``recipes/train_halgan.py``); ``--weights`` takes any other. Its
     output is tabulated once and then looked up (`halgan_rl.hallucination_bank`); ``--no-bank`` asks the generator.
     Both images of a row show one latent's goal (the paper does not tell; its preset draws one for each image).
-
 11. The actor's last layer starts near zero, as in DDPG's own paper: without it an untrained robot may drive in circles
     that meet the box by chance (8 % of the starts with seed 0).
 12. A moving average of the actor's weights, over some 500 updates, is what is evaluated and saved. The policy that
