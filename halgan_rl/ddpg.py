@@ -8,6 +8,7 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.modules import AdditiveGaussianModule, EGreedyModule
 from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
 
+from halgan_rl import experiment
 from halgan_rl.experiment import HindsightConfig
 from halgan_rl.models.agents import Actor, Critic, deterministic_policy
 from halgan_rl.objectives import ClippedTD0Estimator, UnsaturatedDDPGLoss
@@ -29,6 +30,14 @@ class DDPGConfig(HindsightConfig):
     noise: float = 0.1
     """Standard deviation of the Gaussian noise on the actions."""
 
+
+PAPER = experiment.PAPER | {
+    "actor_learning_rate": 1e-5,
+    "critic_learning_rate": 1e-4,
+    "preactivation_weight": 0.0,
+    "small_output": False,
+}
+"""What the paper's tables say alike for all tasks with continuous actions."""
 
 FIGURES = {"pred_value": "q_value", "loss_value": "loss_value", "loss_actor": "loss_actor"}
 """Which of the loss's outputs are reported, and as what."""

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -149,6 +149,20 @@ class HindsightConfig:
                 "for their future before they can be sampled; warm up longer"
             )
 
+
+PAPER: dict[str, Any] = {
+    "warmup_frames": 10_000,
+    "target_rate": 1e-3,
+    "clip_targets": False,
+    "bank": False,
+    "share_latent": False,
+    "nearness": 1.0,
+    "discount": 0.99,
+    "downsample": "max_pool",
+    "policy_average": 0.0,
+    "epsilon_end": 0.5,
+}
+"""What the paper's tables say alike for all tasks (Sahni et al., NeurIPS 2019, appendix)."""
 
 Config = TypeVar("Config", bound=HindsightConfig)
 

@@ -54,7 +54,7 @@ import dataclasses
 from pathlib import Path
 
 import envs
-from halgan_rl.ddpg import DDPGConfig, make_agent
+from halgan_rl.ddpg import PAPER, DDPGConfig, make_agent
 from halgan_rl.experiment import run
 from halgan_rl.presets import parse_config
 
@@ -70,24 +70,11 @@ class Config(DDPGConfig):
 PRESETS = {
     "default": Config(),
     "paper": Config(
+        **PAPER,
         preset="paper",
         environment="navigate-4m",
         total_frames=250_000,
-        warmup_frames=10_000,
-        actor_learning_rate=1e-5,
-        critic_learning_rate=1e-4,
-        target_rate=1e-3,
-        clip_targets=False,
-        preactivation_weight=0.0,
-        bank=False,
-        share_latent=False,
-        nearness=1.0,
         max_distance=32,
-        discount=0.99,
-        downsample="max_pool",
-        small_output=False,
-        policy_average=0.0,
-        epsilon_end=0.5,
         epsilon_frames=100_000,
         hallucination_frames=100_000,
     ),

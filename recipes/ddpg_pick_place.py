@@ -26,7 +26,7 @@ import dataclasses
 from pathlib import Path
 
 import envs
-from halgan_rl.ddpg import DDPGConfig, make_agent
+from halgan_rl.ddpg import PAPER, DDPGConfig, make_agent
 from halgan_rl.experiment import run
 from halgan_rl.presets import parse_config
 
@@ -54,25 +54,12 @@ class Config(DDPGConfig):
 PRESETS = {
     "default": Config(),
     "paper": Config(
+        **PAPER,
         preset="paper",
         total_frames=500_000,
-        warmup_frames=10_000,
         frames_per_update=1,
-        actor_learning_rate=1e-5,
-        critic_learning_rate=1e-4,
-        target_rate=1e-3,
-        clip_targets=False,
-        preactivation_weight=0.0,
-        bank=False,
-        share_latent=False,
         random_flags=True,
-        nearness=1.0,
         max_distance=16,
-        discount=0.99,
-        downsample="max_pool",
-        small_output=False,
-        policy_average=0.0,
-        epsilon_end=0.5,
         epsilon_frames=250_000,
         hallucination_frames=250_000,
     ),

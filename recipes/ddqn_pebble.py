@@ -17,7 +17,7 @@ from pathlib import Path
 
 import envs
 from halgan_rl.ddqn import DDQNConfig, make_agent
-from halgan_rl.experiment import run
+from halgan_rl.experiment import PAPER, run
 from halgan_rl.presets import parse_config
 
 
@@ -40,19 +40,10 @@ class Config(DDQNConfig):
 PRESETS = {
     "default": Config(),
     "paper": Config(
+        **PAPER,
         preset="paper",
         total_frames=250_000,
-        warmup_frames=10_000,
-        target_rate=1e-3,
-        clip_targets=False,
-        bank=False,
-        share_latent=False,
-        nearness=1.0,
         max_distance=16,
-        discount=0.99,
-        downsample="max_pool",
-        policy_average=0.0,
-        epsilon_end=0.5,
         epsilon_frames=100_000,
         hallucination_start=0.2,
         hallucination_frames=100_000,
