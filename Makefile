@@ -34,7 +34,8 @@ bench: $(BENCH_VENV)/ready  ## speed and memory side by side with the peers, in 
 weights: $(VENV)/ready  ## train the shipped generators again (a few minutes)
 	for environment in navigate-2m navigate-4m pick-and-place-2m pebble; do \
 	  run=runs/weights-$$environment shipped=halgan_rl/shipped/$$environment; \
-	  $(BIN)/python recipes/train_halgan.py --environment $$environment --seed 0 --out $$run && \
+	  test $$environment = pebble && noise=0.05 || noise=0.7; \
+	  $(BIN)/python recipes/train_halgan.py --environment $$environment --seed 0 --latent-noise $$noise --out $$run && \
 	  cp $$run/generator.safetensors $$shipped.safetensors && \
 	  cp $$run/generator.json $$shipped.json && \
 	  cp $$run/hallucinations.png $$shipped.png || exit 1; done

@@ -20,8 +20,6 @@ from halgan_rl.training_data import Frames, matching_flags
 
 LEVELS = 16
 """Levels of each colour channel that are told apart."""
-NOISE = 0.7
-"""Share of noise in the latents: without it they learn to tell where the goal of a rollout is, as the poses should."""
 LATENT_RATE = 15.0
 """Learning rate of the latents, in units of that of the weights: each sees few of the frames."""
 
@@ -37,6 +35,7 @@ def warm_start(
     pixels: int = 512,
     learning_rate: float = 4e-3,
     mirror: bool = True,
+    latent_noise: float = 0.7,
 ) -> Iterator[float]:
     """Fit a generator's mattes to the goals of near-goal frames.
 
@@ -51,10 +50,18 @@ def warm_start(
         pixels: random pixels of each of them; the generator's cost is that of the pixels that it is asked for.
         learning_rate: at first; it falls linearly to a twentieth.
         mirror: mirror half of the frames left to right.
+        latent_noise: share of noise in the latents, in [0, 1]. The more of it, the less they tell where the goal of a
+            rollout is, as the poses should; what neither tells comes out blurred. A goal that is small beside the
+            places where it counts as reached wants little noise.
 
     Yields:
         The loss after each step.
+
+    Raises:
+        ValueError: if the share of noise is out of range.
     """
+    if not 0 <= latent_noise <= 1:
+        raise ValueError(f"latent_noise={latent_noise} must be within [0, 1]: it is a share")
     frames, encoding = near_goal["pixels"], generator.encoding
     labels = encoding.labels(near_goal["pose"], near_goal["goal_pose"])
     flags, failed_flags = matching_flags(near_goal, failed)
@@ -79,7 +86,7 @@ def warm_start(
         features = encoding(torch.where(flip[:, None], encoding.mirror(labels[rows]), labels[rows]))
         standard = (latents - latents.mean(0)) / latents.std(0)  # as the latent's prior has it
         noise = torch.randn(batch_size, generator.latent_size, generator=rng)
-        latent = (1 - NOISE**2) ** 0.5 * standard[rollouts[rows] + count * flip] + NOISE * noise
+        latent = (1 - latent_noise**2) ** 0.5 * standard[rollouts[rows] + count * flip] + latent_noise * noise
         matte = generator.matte_at(generator.coordinates[where], features, latent)
         mask = is_goal[flags[rows, None], colour_index(colours)]
         loss = _matte_loss(matte, colours, mask.float())

@@ -118,6 +118,9 @@ class Config:
     """Scale the configuration's features to mean 0 and variance 1."""
     warm_start_steps: int = 2_500
     """Steps of the warm start before the game; needs the generator by coordinates."""
+    latent_noise: float = 0.7
+    """Share of noise in the warm start's latents; goals that are small beside the places where they count as reached,
+    as the pebble, need less of it."""
     discriminator_stride: Literal[1, 2] = 2
     """Stride of the discriminator's first convolution."""
     game: GanSettings = dataclasses.field(
@@ -148,6 +151,8 @@ class Config:
                 raise ValueError(f"{name}={getattr(self, name)} must not be negative")
         if self.minutes is not None and not self.minutes > 0:
             raise ValueError(f"minutes={self.minutes} must be positive")
+        if not 0 <= self.latent_noise <= 1:
+            raise ValueError(f"latent_noise={self.latent_noise} must be within [0, 1]")
         if self.warm_start_steps and self.generator == "paper":
             raise ValueError(
                 f"warm_start_steps={self.warm_start_steps} needs --generator coordinates: "
@@ -229,8 +234,8 @@ def train(
     """Yield after each step, of the warm start and then of the game, the generator worth keeping and the losses."""
     data = {"near_goal": near_goal, "failed": failed}
     if isinstance(generator, CoordinateGenerator):
-        mirror = config.game.mirror
-        for loss in warm_start(generator, **data, steps=config.warm_start_steps, mirror=mirror, rng=rng):
+        settings = {"mirror": config.game.mirror, "latent_noise": config.latent_noise}
+        for loss in warm_start(generator, **data, steps=config.warm_start_steps, **settings, rng=rng):
             yield generator, {"warm_start/loss": loss}
     discriminator = Discriminator(generator.encoding.size, config.discriminator_stride)
     trainer = HalganTrainer(generator, discriminator, **data, settings=config.game, rng=rng)

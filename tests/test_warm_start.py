@@ -61,6 +61,38 @@ def test_goals_without_failed_frames_to_paint_them_into_are_refused() -> None:
         )
 
 
+def test_what_the_pose_does_not_tell_is_sharp_only_if_the_latents_may_tell_it() -> None:
+    data, failed = synthetic.near_goal(256), synthetic.failed()
+    shifts = torch.randint(-12, 13, (256 // 8,), generator=torch.Generator().manual_seed(1)).repeat_interleave(8)
+    rolled = [frame.roll(int(shift), 1) for frame, shift in zip(data["pixels"], shifts, strict=True)]
+    data["pixels"] = torch.stack(rolled)
+
+    def opacity(latent_noise: float) -> float:
+        torch.manual_seed(0)
+        generator, rng = CoordinateGenerator(), torch.Generator().manual_seed(0)
+        labels = generator.encoding.labels(data["pose"], data["goal_pose"])
+        generator.encoding.standardise(labels)
+        size = {"batch_size": 64, "pixels": 128}
+        losses = warm_start(
+            generator, near_goal=data, failed=failed, steps=150, rng=rng, latent_noise=latent_noise, **size
+        )
+        assert len(list(losses)) == 150
+        with torch.no_grad():
+            matte = generator(generator.encoding(labels), generator.sample_latent(256, rng))
+        return float(matte[:, 3].flatten(1).amax(1).mean())
+
+    sharp, blurred = opacity(0.05), opacity(1.0)
+    assert sharp > 1.3 * blurred
+
+
+@pytest.mark.parametrize("noise", [-0.1, 1.1])
+def test_a_share_of_noise_beyond_all_of_it_is_refused(noise: float) -> None:
+    data, failed = synthetic.near_goal(16), synthetic.failed(16)
+    rng = torch.Generator()
+    with pytest.raises(ValueError, match=f"latent_noise={noise}"):
+        next(warm_start(CoordinateGenerator(), near_goal=data, failed=failed, steps=1, rng=rng, latent_noise=noise))
+
+
 def test_equal_seeds_give_equal_weights() -> None:
     one, same, other = (train(3, seed)[0].state_dict() for seed in (0, 0, 1))
     assert all(torch.equal(one[name], same[name]) for name in one)

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -106,11 +107,12 @@ def test_an_unknown_environment_is_refused_with_those_there_are_before_the_folde
 
 
 @pytest.mark.parametrize(
-    "changes", [{"near_goal_frames": 0}, {"iterations": -1}, {"minutes": 0}, {"generator": "paper"}]
+    "changes",
+    [{"near_goal_frames": 0}, {"iterations": -1}, {"minutes": 0}, {"generator": "paper"}, {"latent_noise": 2.0}],
 )
-def test_values_that_cannot_work_are_refused(changes: dict[str, int]) -> None:
+def test_values_that_cannot_work_are_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(changes))):
-        dataclasses.replace(Config(), **changes)  # type: ignore[arg-type]
+        dataclasses.replace(Config(), **changes)
 
 
 def test_the_preset_chooses_the_defaults_and_flags_win() -> None:
