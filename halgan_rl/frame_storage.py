@@ -368,7 +368,7 @@ class FrameStorage(LazyTensorStorage):
         """Takes frames ``[2, N, ...]`` in and lets go of those at ``places`` ``[N]``. Returns slots ``[2, N]``."""
         dropped = torch.cat([self._storage.get(key)[places] for key in self._keys])
         try:
-            slots = self._table.exchange(frames.reshape(2 * len(places), -1), dropped[dropped >= 0])
+            slots = self._table.exchange(frames.reshape(2 * len(places), -1), dropped=dropped[dropped >= 0])
         except FrameTableFullError as error:
             raise RuntimeError(
                 f"FrameStorage has no room for the frames of these {len(places)} rows, none of which was written: with "
