@@ -159,7 +159,7 @@ class FrameStorage(LazyTensorStorage):
         self.pixels_key = pixels_key
         self.bytes_per_row = 0
         self.nbytes = 0
-        self._keys = (pixels_key, next_key(pixels_key))
+        self._keys = (unravel_key(pixels_key), unravel_key(next_key(pixels_key)))
         self._table: FrameTable
         self._frame_shape: torch.Size
 
@@ -177,19 +177,20 @@ class FrameStorage(LazyTensorStorage):
             set_cursor: Whether the length grows so as to include the rows; a buffer's writer wants that.
         """
         places, rows = self._read_rows(cursor, data)
-        if not len(places):
+        if not places:
             return
         frames = self._read_frames(rows)
-        rows = rows.exclude(*self._keys).to("cpu")
-        self._set_slots(rows, torch.full((2, len(rows)), -1))
         if not self.initialized:
-            self._allocate(rows[0], frames.shape[2:])
-        self._check_fit(rows, frames.shape[2:])
-        self._set_slots(rows, self._exchange(frames, places))
-        self._storage[places] = rows
+            self._allocate(rows[0].exclude(*self._keys).to("cpu"), frames[0].shape[1:])
+        entries = self._read_entries(rows)
+        self._check_fit(entries, frames[0].shape[1:])
+        index = torch.tensor(places, dtype=torch.int64)
+        self._slots.index_copy_(1, index, self._exchange(frames, index))
+        for key, value in entries.items():
+            self._entries[key].index_copy_(0, index, value)
         if set_cursor:
             self._set_last_cursor(cursor)
-            self._len = max(len(self), int(places.max()) + 1)
+            self._len = max(len(self), max(places) + 1)
         self._bump_mutation_revision()
 
     def get(self, index: Places) -> TensorDictBase:
@@ -235,11 +236,13 @@ class FrameStorage(LazyTensorStorage):
         self._len = 0
         if self.initialized:
             self._table.clear()
-            self._forget_slots()
+            self._slots.fill_(-1)
         self._bump_mutation_revision()
 
-    def _read_rows(self, cursor: Places, data: TensorDictBase | list[TensorDictBase]) -> tuple[Tensor, TensorDictBase]:
-        """Returns places ``[N]``, all different, and the rows ``[N]`` for them."""
+    def _read_rows(
+        self, cursor: Places, data: TensorDictBase | list[TensorDictBase]
+    ) -> tuple[list[int], TensorDictBase]:
+        """Returns N places, all different, and the rows ``[N]`` for them."""
         rows = torch.stack(data) if isinstance(data, list) else data
         if not isinstance(rows, TensorDictBase):
             raise TypeError(f"FrameStorage keeps TensorDicts, got a {type(data).__name__}: make one of it")
@@ -255,16 +258,17 @@ class FrameStorage(LazyTensorStorage):
                 f"FrameStorage got rows of batch size {tuple(rows.batch_size)} for places {tuple(places.shape)}: write "
                 "rows [N], such as replay_buffer.extend(rows.reshape(-1))"
             )
-        beyond = (places < -self.max_size) | (places >= self.max_size)
-        if beyond.any():
-            raise IndexError(f"row {int(places[beyond][0])} is beyond max_size={self.max_size}: make it larger")
-        last = {place: position for position, place in enumerate((places % self.max_size).tolist())}
+        last: dict[int, int] = {}
+        for position, place in enumerate(places.tolist()):
+            if not -self.max_size <= place < self.max_size:
+                raise IndexError(f"row {place} is beyond max_size={self.max_size}: make it larger")
+            last[place % self.max_size] = position
         if len(last) < len(places):
             rows = rows[torch.tensor(list(last.values()))]
-        return torch.tensor(list(last), dtype=torch.int64), rows
+        return list(last), rows
 
-    def _read_frames(self, rows: TensorDictBase) -> Tensor:
-        """Returns the frames before and after, ``[2, N, ...]``."""
+    def _read_frames(self, rows: TensorDictBase) -> list[Tensor]:
+        """Returns the frames before and after, each ``[N, ...]``."""
         frames = []
         for key in self._keys:
             value = rows.get(key, None)
@@ -278,18 +282,17 @@ class FrameStorage(LazyTensorStorage):
                     f"FrameStorage keeps frames of uint8, but the entry {dotted(key)} is {value.dtype}: write what the "
                     "camera gives, and convert it when it is sampled"
                 )
-            frames.append(value)
+            frames.append(value.cpu())
         if frames[0].shape != frames[1].shape:
             raise ValueError(
                 f"frames before and after an action must have one shape, got {tuple(frames[0].shape)} and "
                 f"{tuple(frames[1].shape)} for {dotted(self._keys[0])} and {dotted(self._keys[1])}"
             )
-        return torch.stack(frames).cpu()
+        return frames
 
-    def _set_slots(self, rows: TensorDictBase, slots: Tensor) -> None:
-        """Sets the numbers ``[2, N]`` of the frames before and after in place of the frames."""
-        for key, numbers in zip(self._keys, slots, strict=True):
-            rows.set(key, numbers)
+    def _read_entries(self, rows: TensorDictBase) -> dict[NestedKey, Tensor]:
+        """Returns the entries that are no frames."""
+        return {key: value.cpu() for key, value in rows.items(True, True) if key not in self._keys}
 
     def _put_frames(self, rows: TensorDictBase, frames: Tensor, shape: torch.Size) -> TensorDictBase:
         """Sets the frames in place of their numbers; takes them from ``frames`` ``[slots, bytes]``."""
@@ -304,7 +307,7 @@ class FrameStorage(LazyTensorStorage):
         """Makes room for ``max_size`` rows like ``row`` and their frames, if there is any."""
         size, slots = shape.numel(), self.max_size + self.extra_frames
         entries = sum(value.nbytes for value in row.values(True, True))
-        bytes_per_row = entries + size + OVERHEAD
+        bytes_per_row = entries + 2 * torch.int64.itemsize + size + OVERHEAD
         nbytes = self.max_size * bytes_per_row + self.extra_frames * (size + OVERHEAD)
         remedy = f"max_size={self.max_size} rows of {bytes_per_row} bytes, extra_frames={self.extra_frames}"
         _LOGGER.info("FrameStorage takes %s: %s", _readable(nbytes), remedy)
@@ -313,12 +316,20 @@ class FrameStorage(LazyTensorStorage):
             frames = torch.empty(slots, size, dtype=torch.uint8)
             empty = partial(torch.empty_like, memory_format=torch.contiguous_format)
             self._storage = row.expand(self.max_size).apply(empty)
+            self._slots = torch.empty(2, self.max_size, dtype=torch.int64)
         else:
-            self._storage, frames = self._map(row, slots, size, self.scratch_dir)
+            self._storage, self._slots, frames = self._map(row, slots, size, self.scratch_dir)
+        self._slots.fill_(-1)
         self.initialized = True
         self.bytes_per_row, self.nbytes = bytes_per_row, nbytes
         self._frame_shape, self._table = shape, FrameTable(frames)
-        self._forget_slots()
+        self._set_views()
+
+    def _set_views(self) -> None:
+        """Sets what rows are written into, ``_entries``, and read from, ``_columns``: views of the same memory."""
+        self._entries = self._read_entries(self._storage)
+        for key, numbers in zip(self._keys, self._slots, strict=True):
+            self._storage.set(key, numbers)
         self._columns = self._make_columns()
 
     def _make_columns(self) -> dict[str, Any]:
@@ -326,37 +337,34 @@ class FrameStorage(LazyTensorStorage):
         columns = self._storage.to_dict()
         frames = self._table.frames.unflatten(1, self._frame_shape)
         for key in self._keys:
-            *path, name = unravel_key(key) if isinstance(key, tuple) else (key,)
+            *path, name = key if isinstance(key, tuple) else (key,)
             parent = reduce(dict.__getitem__, path, columns)
             parent[name] = _FrameColumn(parent[name], frames)
         return columns
 
-    def _map(self, row: TensorDictBase, slots: int, size: int, folder: Path) -> tuple[TensorDictBase, Tensor]:
-        """Maps rows and frames ``[slots, size]`` to files that are gone when this returns, though not their content."""
+    def _map(self, row: TensorDictBase, slots: int, size: int, folder: Path) -> tuple[TensorDictBase, Tensor, Tensor]:
+        """Maps rows, their slots, frames ``[slots, size]`` to files that are gone when this returns: content stays."""
         with TemporaryDirectory(dir=folder, prefix="frame_storage-") as temporary:
             rows = row.expand(self.max_size).memmap_like(Path(temporary, "rows"))
             frames = torch.from_file(str(Path(temporary, "frames")), True, slots * size, dtype=torch.uint8)
-        return rows.apply(_as_tensor), frames.view(slots, size)
+            numbers = torch.from_file(str(Path(temporary, "slots")), True, 2 * self.max_size, dtype=torch.int64)
+        return rows.apply(_as_tensor), numbers.view(2, -1), frames.view(slots, size)
 
-    def _forget_slots(self) -> None:
-        for key in self._keys:
-            self._storage.get(key).fill_(-1)
-
-    def _check_fit(self, rows: TensorDictBase, shape: torch.Size) -> None:
+    def _check_fit(self, entries: dict[NestedKey, Tensor], shape: torch.Size) -> None:
         """Refuses rows ``[N]`` with other entries or frames than those stored."""
         if shape != self._frame_shape:
             raise ValueError(
                 f"FrameStorage holds frames of shape {tuple(self._frame_shape)}, these are {tuple(shape)}: write one "
                 "shape only, or into another storage"
             )
-        stored, given = dict(self._storage.items(True, True)), dict(rows.items(True, True))
-        if stored.keys() != given.keys():
-            added, lacking = _names(given.keys() - stored.keys()), _names(stored.keys() - given.keys())
+        stored = self._entries
+        if stored.keys() != entries.keys():
+            added, lacking = _names(entries.keys() - stored.keys()), _names(stored.keys() - entries.keys())
             raise KeyError(
                 f"these rows have {added} and lack {lacking}, unlike those that FrameStorage holds: write the "
                 "same entries always"
             )
-        for key, value in given.items():
+        for key, value in entries.items():
             kept = stored[key]
             if (value.shape[1:], value.dtype) != (kept.shape[1:], kept.dtype):
                 raise ValueError(
@@ -364,11 +372,11 @@ class FrameStorage(LazyTensorStorage):
                     f"{value.dtype} {tuple(value.shape[1:])}: write one dtype and shape only"
                 )
 
-    def _exchange(self, frames: Tensor, places: Tensor) -> Tensor:
-        """Takes frames ``[2, N, ...]`` in and lets go of those at ``places`` ``[N]``. Returns slots ``[2, N]``."""
-        dropped = torch.cat([self._storage.get(key)[places] for key in self._keys])
+    def _exchange(self, frames: list[Tensor], places: Tensor) -> Tensor:
+        """Takes frames, two ``[N, ...]``, in and lets go of those at ``places`` ``[N]``. Returns slots ``[2, N]``."""
+        dropped = self._slots.index_select(1, places)
         try:
-            slots = self._table.exchange(frames.reshape(2 * len(places), -1), dropped[dropped >= 0])
+            slots = self._table.exchange(*(each.flatten(1) for each in frames), dropped=dropped[dropped >= 0])
         except FrameTableFullError as error:
             raise RuntimeError(
                 f"FrameStorage has no room for the frames of these {len(places)} rows, none of which was written: with "
@@ -376,7 +384,7 @@ class FrameStorage(LazyTensorStorage):
                 "shows before its action, such as the last of each episode, need room beyond one a row: pass "
                 f"extra_frames={self.extra_frames + error.missing} or more; max_size={self.max_size} is always enough"
             ) from error
-        return slots.view(2, -1)
+        return slots.view(-1, 2).T
 
     def _read_state(self, state: dict[str, Any]) -> tuple[TensorDictBase, Tensor]:
         """Returns a state's rows ``[N]``, with slots, and its frames ``[slots, ...]``, as copies where need be."""
@@ -386,7 +394,9 @@ class FrameStorage(LazyTensorStorage):
         slots = torch.stack([rows.get(key) for key in self._keys])
         if len(rows) > self.max_size:
             raise ValueError(f"the state holds {len(rows)} rows, more than max_size={self.max_size}: make it larger")
-        if slots.dtype != torch.int64 or slots.min() < 0 or slots.max() >= len(frames) or frames.dtype != torch.uint8:
+        if slots.dtype != torch.int64 or slots.ndim != 2 or frames.dtype != torch.uint8:
+            raise ValueError("the state is damaged: its rows hold no numbers of frames, or its frames are not uint8")
+        if slots.min() < 0 or slots.max() >= len(frames):
             raise ValueError(f"the state is damaged: its rows refer to frames that it lacks, of {len(frames)}")
         missing = len(slots.unique()) - self.max_size - self.extra_frames
         if missing > 0:
@@ -395,7 +405,7 @@ class FrameStorage(LazyTensorStorage):
                 f"{self.extra_frames}: pass extra_frames={self.extra_frames + missing}"
             )
         if self.initialized:
-            self._check_fit(rows, frames.shape[1:])
+            self._check_fit(self._read_entries(rows), frames.shape[1:])
             if _share_memory(frames, self._table.frames):
                 frames = frames.clone()
         return rows, frames
@@ -410,6 +420,11 @@ class FrameStorage(LazyTensorStorage):
         if get_spawning_popen() is not None:
             raise RuntimeError("FrameStorage belongs to one process: build the buffer in the process that uses it")
         return super().__getstate__()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        if self.initialized:
+            self._set_views()  # those of a copy are of its own memory
 
 
 class _FrameColumn:

@@ -1,5 +1,8 @@
 """Frames, each kept once, however many rows of a replay buffer show it."""
 
+from collections import Counter
+
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -50,8 +53,8 @@ class FrameTable:
 
     def __init__(self, frames: Tensor) -> None:
         self.frames = frames
-        self._counts = torch.zeros(len(frames), dtype=torch.int64)
-        self._hashes = torch.zeros(len(frames), dtype=torch.int64)
+        self._counts = np.zeros(len(frames), dtype=np.int64)
+        self._hashes = np.zeros(len(frames), dtype=np.int64)
         self.clear()
 
     def __len__(self) -> int:
@@ -60,79 +63,81 @@ class FrameTable:
 
     def clear(self) -> None:
         """Drops all references."""
-        self._counts.zero_()
+        self._counts.fill(0)
         self._slot_of: dict[int, int] = {}  # by hash
         self._freed: list[int] = []
         self.used = 0
 
-    def exchange(self, frames: Tensor, dropped: Tensor | None = None) -> Tensor:
+    def exchange(self, *frames: Tensor, dropped: Tensor | None = None) -> Tensor:
         """Takes a reference to each of ``frames`` and drops one to each slot of ``dropped``.
 
         Args:
-            frames: ``[N, bytes]`` uint8.
+            frames: ``[N, bytes]`` uint8. The rows of several are taken by turns: the first of each, the second of
+                each, ... A row like the one before it costs least.
             dropped: slots, int64 ``[M]``; one that occurs twice loses two references.
 
         Returns:
-            The frames' slots, int64 ``[N]``.
+            The slots of all rows, in this order, int64.
 
         Raises:
             FrameTableFullError: if they do not fit; nothing has changed then.
         """
-        slots, new, hashes = self._find(frames)
-        known = slots >= 0
-        self._drop_and_take(slots[:0] if dropped is None else dropped, slots[known], room_for=len(new))
-        places = -1 - slots[~known]
-        stored = self._store(frames.index_select(0, new), hashes)
-        self._counts[stored] = places.bincount(minlength=len(new))
-        slots[~known] = stored[places]
-        return slots
+        given = [row for rows in zip(*(each.numpy() for each in frames), strict=True) for row in rows]
+        found, new = self._find(given)
+        references = Counter(found)
+        references.subtract([] if dropped is None else dropped.tolist())
+        self._change_counts({slot: change for slot, change in references.items() if slot >= 0}, room_for=len(new))
+        stored = self._store(new, references)
+        return torch.tensor([slot if slot >= 0 else stored[-1 - slot] for slot in found], dtype=torch.int64)
 
-    def _find(self, frames: Tensor) -> tuple[Tensor, Tensor, list[int]]:
-        """Returns the slots of frames, -1 - k for the k-th new one; positions and hashes of the new ones."""
+    def _find(self, frames: list[np.ndarray]) -> tuple[list[int], list[tuple[np.ndarray, int]]]:
+        """Returns the slots of frames, -1 - k for the k-th new one; the new ones and their hashes."""
         slots: list[int] = []
-        new: list[int] = []
-        hashes: list[int] = []
+        new: list[tuple[np.ndarray, int]] = []
         places: dict[int, int] = {}  # of new frames, by hash
-        kept, given = self.frames.numpy(), frames.numpy()
-        for position, frame in enumerate(given):
+        kept, last = self.frames.numpy(), None
+        for frame in frames:
             content = frame.tobytes()
-            key = hash(content)
+            if content == last:  # compared in a tenth of the time of hashing
+                slots.append(slots[-1])
+                continue
+            key, last = hash(content), content
             slot = self._slot_of.get(key, -1)
             if slot < 0 or kept[slot].tobytes() != content:
                 place = places.setdefault(key, len(new))
-                if place < len(new) and given[new[place]].tobytes() != content:
+                if place < len(new) and new[place][0].tobytes() != content:
                     place = len(new)  # another frame with the same hash
                 if place == len(new):
-                    new.append(position)
-                    hashes.append(key)
+                    new.append((frame, key))
                 slot = -1 - place
             slots.append(slot)
-        return torch.tensor(slots, dtype=torch.int64), torch.tensor(new, dtype=torch.int64), hashes
+        return slots, new
 
-    def _drop_and_take(self, dropped: Tensor, taken: Tensor, room_for: int) -> None:
-        """Updates the counts of slots in use and frees those without a reference, if there is room then."""
-        slots, place = torch.cat([dropped, taken]).unique(return_inverse=True)
-        change = torch.cat([-torch.ones_like(dropped), torch.ones_like(taken)])
-        counts = self._counts[slots].index_add(0, place, change)
-        idle = slots[counts == 0]
+    def _change_counts(self, changes: dict[int, int], room_for: int) -> None:
+        """Changes the counts of slots in use and frees those without a reference, if there is room then."""
+        idle = [slot for slot, change in changes.items() if self._counts.item(slot) + change == 0]
         missing = room_for - (len(self.frames) - len(self)) - len(idle)
         if missing > 0:
             raise FrameTableFullError(missing)
-        self._counts[slots] = counts
-        for slot, key in zip(idle.tolist(), self._hashes[idle].tolist(), strict=True):
+        for slot, change in changes.items():
+            self._counts[slot] += change
+        for slot in idle:
             self._freed.append(slot)
+            key = self._hashes.item(slot)
             if self._slot_of.get(key) == slot:
                 del self._slot_of[key]
 
-    def _store(self, frames: Tensor, hashes: list[int]) -> Tensor:
-        """Copies frames into free slots, which it returns; there must be enough of them."""
-        again = [self._freed.pop() for _ in range(min(len(hashes), len(self._freed)))]
-        fresh = range(self.used, self.used + len(hashes) - len(again))
-        self.used += len(fresh)
-        numbers = [*again, *fresh]
-        for slot, key in zip(numbers, hashes, strict=True):
+    def _store(self, new: list[tuple[np.ndarray, int]], references: Counter[int]) -> list[int]:
+        """Copies frames, with their hashes, into free slots, which it returns; there must be enough of them."""
+        slots = []
+        kept = self.frames.numpy()
+        for place, (frame, key) in enumerate(new):
+            if self._freed:
+                slot = self._freed.pop()
+            else:
+                slot, self.used = self.used, self.used + 1
+            kept[slot] = frame
+            self._counts[slot], self._hashes[slot] = references[-1 - place], key
             self._slot_of.setdefault(key, slot)
-        slots = torch.tensor(numbers, dtype=torch.int64)
-        self.frames.index_copy_(0, slots, frames)
-        self._hashes[slots] = torch.tensor(hashes, dtype=torch.int64)
+            slots.append(slot)
         return slots

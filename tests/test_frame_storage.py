@@ -122,6 +122,7 @@ def test_any_interleaving_of_environments_episodes_and_wraps_gives_the_rows_of_a
             written += 1
         assert len(storage) == len(kept)
         assert_identical(storage[:], torch.stack(kept))
+        assert_identical(storage[torch.arange(len(kept))], torch.stack(kept))
         assert storage.frames_kept == len(shown(kept))
 
 
@@ -174,6 +175,7 @@ def test_writing_at_any_places_in_any_order_gives_the_rows_of_a_plain_list(batch
         range(2, 5),
         [4, 0, 4],
         torch.tensor([5, 5, 1]),
+        torch.tensor([], dtype=torch.int64),
         torch.tensor([[0, 1], [2, 3]]),
         torch.tensor(2),
         torch.arange(7) % 2 == 0,
@@ -265,12 +267,14 @@ def test_emptied_it_takes_new_rows() -> None:
     assert_identical(buffer.storage[:].exclude("index"), episode(6, first=70))
 
 
-def test_a_deep_copy_goes_its_own_way() -> None:
-    storage = wrapped()
+@pytest.mark.parametrize("mapped", [False, True], ids=["in memory", "mapped"])
+def test_a_deep_copy_goes_its_own_way(mapped: bool, tmp_path: Path) -> None:
+    storage = wrapped(scratch_dir=tmp_path if mapped else None)
     rows, twin = storage[:], copy.deepcopy(storage)
     for first in (300, 400, 500):
         twin.set(range(10), episode(10, first))
     assert_identical(twin[:], episode(10, 500))
+    assert_identical(twin[torch.arange(10)], episode(10, 500))
     assert twin.frames_kept == 11
     assert_identical(storage[:], rows)
 

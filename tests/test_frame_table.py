@@ -26,6 +26,14 @@ def test_equal_frames_share_a_slot_within_a_batch_and_across_batches() -> None:
     assert len(kept) == 3
 
 
+def test_frames_of_several_tensors_are_taken_by_turns() -> None:
+    kept = table(4)
+    assert kept.exchange(frames(5, 6, 6), frames(6, 8, 5)).tolist() == [0, 1, 1, 2, 1, 0]
+    kept.exchange(frames(), frames(), dropped=torch.tensor([1, 0, 1, 0]))
+    assert len(kept) == 2
+    assert torch.equal(gather(kept.frames, torch.tensor([1, 2])), frames(6, 8))
+
+
 def test_a_frame_stays_until_its_last_reference_is_dropped() -> None:
     kept = table(2)
     kept.exchange(frames(5, 5, 6))
