@@ -19,8 +19,8 @@ def find_pebble(
     Args:
         random_state: Seed or generator of the starts.
         time_limit: Seconds an episode; a step takes 0.25 s.
-        reverse_speed: Of the robot's fourth action, backward [m/s]; 0: it has no reverse gear, the fourth action creeps
-            forward.
+        reverse_speed: Of the robot's fourth action, backward [m/s]; 0: it has no reverse gear, the fourth action drives
+            fast.
 
     Raises:
         ValueError: if the reverse speed is negative or more than the robot reaches.

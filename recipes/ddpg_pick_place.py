@@ -37,7 +37,7 @@ class Config(DDPGConfig):
 
     environment: str = "pick-and-place-2m"
     """One of `envs.NAMES`."""
-    total_frames: int = 150_000
+    total_frames: int = 60_000
     """Environment steps."""
     out: Path = Path("runs/ddpg_pick_place")
     """Folder of the run; must not hold one yet."""

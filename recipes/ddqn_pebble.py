@@ -27,7 +27,7 @@ class Config(DDQNConfig):
 
     environment: str = "pebble"
     """One of `envs.NAMES`."""
-    total_frames: int = 60_000
+    total_frames: int = 30_000
     """Environment steps."""
     out: Path = Path("runs/ddqn_pebble")
     """Folder of the run; must not hold one yet."""

@@ -46,17 +46,19 @@ _SINK = 3e-5
 _BUMPER = {"condim": 3, "friction": [0.2, 0.005, 0.0001]}
 """The base touches with a little friction: stalled wheels would let it pivot freely at what it runs into."""
 
-FORWARD, LEFT, RIGHT, CREEP = range(4)
+FORWARD, LEFT, RIGHT, FAST = range(4)
 """The actions that ``MOTIONS`` defines."""
-BACKWARD = CREEP
-"""The action that replaces creeping in a robot with a reverse gear, see :func:`motions_for`."""
+BACKWARD = FAST
+"""The action that replaces driving fast in a robot with a reverse gear, see :func:`motions_for`."""
 
-MOTIONS = ((0.4, 0.0), (0.0, np.deg2rad(48.0)), (0.0, -np.deg2rad(48.0)), (0.16, 0.0))
-"""Forward speed [m/s] and turn rate [rad/s] of each action: in 0.25 s, 0.1 m, 12 degrees, or 0.04 m.
+MOTIONS = ((0.4, 0.0), (0.0, np.deg2rad(96.0)), (0.0, -np.deg2rad(48.0)), (0.64, 0.0))
+"""Forward speed [m/s] and turn rate [rad/s] of each action: in 0.25 s, 0.1 m, 24 degrees, -12 degrees, or 0.16 m.
 
-The paper's network for the TurtleBot has four outputs (Sahni et al., NeurIPS 2019, appendix). The fourth is taken to be
-a slow forward motion here, for the last steps to a goal. It is not backward: a robot that sees only what is ahead would
-back through goals that hindsight puts behind it.
+The paper's network for the TurtleBot has four outputs (Sahni et al., NeurIPS 2019, appendix); what they do is chosen
+here for an agent without memory. Left turns are quick and right ones fine: where no goal is in view, equal turns are
+equally good, and a greedy agent dithers between them for ever; of unequal ones the quick one finds the goal sooner, so
+it searches. Nothing drives backward: a robot that sees only what is ahead would back through goals that hindsight puts
+behind it.
 """
 
 
@@ -216,7 +218,7 @@ class TurtleBot(SightedRobot):
 
 
 def motions_for(reverse_speed: float = 0.0) -> tuple[tuple[float, float], ...]:
-    """``MOTIONS``, or for a robot with a reverse gear the same with backward in place of creeping.
+    """``MOTIONS``, or for a robot with a reverse gear the same with backward in place of driving fast.
 
     Args:
         reverse_speed: Of the reverse gear [m/s]; 0: none.

@@ -6,7 +6,7 @@ import envs
 from envs.robots.turtlebot import (
     BACKWARD,
     BODY_GROUP,
-    CREEP,
+    FAST,
     FORWARD,
     LEFT,
     MOTIONS,
@@ -69,18 +69,18 @@ def test_it_gets_up_to_speed_within_the_first_step(road):
     assert 0.06 < first[0] - start[0] < 0.09
 
 
-@pytest.mark.parametrize(("action", "degrees"), [(LEFT, 12.0), (RIGHT, -12.0)])
-def test_a_turn_is_12_degrees_on_the_spot(road, action, degrees):
+@pytest.mark.parametrize(("action", "degrees"), [(LEFT, 24.0), (RIGHT, -12.0)])
+def test_a_turn_is_24_degrees_to_the_left_or_12_to_the_right_on_the_spot(road, action, degrees):
     place(road, 0.4, -0.2, 1.0)
     *_, last, after = poses(road, *[action] * 3)
     assert np.rad2deg(after[2] - last[2]) == pytest.approx(degrees, abs=0.1)
     np.testing.assert_allclose(after[:2], [0.4, -0.2], atol=1e-3)
 
 
-def test_a_step_of_creeping_is_4_cm_without_turning(road):
+def test_a_fast_step_is_16_cm_without_turning(road):
     place(road, 1.0, 0.5, 0.0)
-    *_, last, after = poses(road, *[CREEP] * 3)
-    np.testing.assert_allclose(after - last, [0.04, 0.0, 0.0], atol=1e-3)
+    *_, last, after = poses(road, *[FAST] * 3)
+    np.testing.assert_allclose(after - last, [0.16, 0.0, 0.0], atol=1e-3)
 
 
 def test_with_a_reverse_gear_the_fourth_action_drives_backward():
@@ -97,7 +97,7 @@ def test_by_default_no_action_drives_backward():
     assert TurtleBot().reverse_speed == 0.0
 
 
-def test_a_reverse_gear_replaces_creeping_only():
+def test_a_reverse_gear_replaces_driving_fast_only():
     robot = TurtleBot(motions=motions_for(0.3))
     assert [robot.velocities(action) for action in range(4)] == [*MOTIONS[:3], (-0.3, 0.0)]
     assert robot.reverse_speed == 0.3
@@ -119,7 +119,7 @@ def test_it_moves_as_far_as_its_wheels_roll(road):
 
 def test_it_turns_as_far_as_its_wheels_roll(road):
     place(road, -1.5, -0.5, 0.0)
-    start, *_, end = poses(road, *[LEFT] * 8)
+    start, *_, end = poses(road, *[RIGHT] * 8)
     left, right = WHEEL_RADIUS * wheel_angles(road)
     assert end[2] - start[2] == pytest.approx((right - left) / WHEEL_BASE, rel=0.01)
     assert left == pytest.approx(-right)
@@ -203,7 +203,7 @@ def test_the_action_for_a_motion_is_that_motion(action):
 
 @pytest.mark.parametrize(
     ("speed", "turn_rate", "action"),
-    [(0.3, 0.4, FORWARD), (0.1, 0.7, LEFT), (9.0, -0.1, FORWARD), (0.1, 0.1, CREEP), (-0.3, 0.0, CREEP)],
+    [(0.3, 0.4, FORWARD), (0.1, 1.2, LEFT), (9.0, -0.1, FAST), (0.1, -0.9, RIGHT), (0.2, 0.0, FORWARD)],
 )
 def test_the_action_for_any_other_motion_is_the_nearest(speed, turn_rate, action):
     assert TurtleBot().action_for(speed, turn_rate) == action
