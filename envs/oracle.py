@@ -58,8 +58,10 @@ class GoalRenderer:
     def _add_goal(self, image: np.ndarray, pose: np.ndarray, goal_position: np.ndarray) -> None:
         visible_groups = self._task.robot.camera.options.geomgroup
         visible_groups[WALL_GROUP] = False
-        without, with_goal = self.render(pose), self.render(pose, goal_position)
-        visible_groups[WALL_GROUP] = True
+        try:
+            without, with_goal = self.render(pose), self.render(pose, goal_position)
+        finally:
+            visible_groups[WALL_GROUP] = True
         np.copyto(image, with_goal, where=(with_goal != without).any(-1, keepdims=True))
 
     def goal_position(self, pose: np.ndarray, goal_pose: np.ndarray) -> np.ndarray:
