@@ -8,6 +8,7 @@ from typing import TypeVar
 import torch
 
 Name = TypeVar("Name")
+Value = TypeVar("Value")
 
 
 def warm_heap(size: int = 32 << 20) -> None:
@@ -27,10 +28,15 @@ def seconds_a_call(run: Callable[[], object], calls: int) -> float:
     return (time.process_time() - started) / calls
 
 
-def alternate(measures: Mapping[Name, Callable[[], float]], rounds: int) -> dict[Name, float]:
-    """Take each measure by turns, in ``rounds`` rounds after one to warm up; return the medians."""
-    values: dict[Name, list[float]] = {name: [] for name in measures}
+def take_turns(measures: Mapping[Name, Callable[[], Value]], rounds: int) -> dict[Name, list[Value]]:
+    """Take each measure by turns, in ``rounds`` rounds after one to warm up; return all but that one's values."""
+    values: dict[Name, list[Value]] = {name: [] for name in measures}
     for _ in range(rounds + 1):
         for name, measure in measures.items():
             values[name].append(measure())
-    return {name: statistics.median(measured[1:]) for name, measured in values.items()}
+    return {name: measured[1:] for name, measured in values.items()}
+
+
+def alternate(measures: Mapping[Name, Callable[[], float]], rounds: int) -> dict[Name, float]:
+    """Take each measure by turns, see :func:`take_turns`; return the medians."""
+    return {name: statistics.median(values) for name, values in take_turns(measures, rounds).items()}

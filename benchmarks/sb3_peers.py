@@ -1,4 +1,4 @@
-"""Stable-Baselines3's buffers and DDPG, on the same rows and networks."""
+"""Stable-Baselines3's buffers, DDPG and DQN, on the same rows and networks."""
 
 from collections.abc import Callable
 from functools import partial
@@ -8,16 +8,19 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
-from stable_baselines3 import DDPG
+from stable_baselines3 import DDPG, DQN
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from tensordict import TensorDict
 from torch import Tensor, nn
 
 from benchmarks.rows import EPISODE, channels_first
+from halgan_rl.experiment import HindsightConfig
 from halgan_rl.models.agents import Vision
 from halgan_rl.models.halgan import LEAK
 
@@ -30,8 +33,8 @@ TOLERANCE = 0.01
 class Still(gymnasium.Env):
     """An environment that is never stepped: it has spaces, and rewards poses that are their goal."""
 
-    def __init__(self, observation_space: spaces.Space) -> None:
-        self.observation_space, self.action_space = observation_space, ACTIONS
+    def __init__(self, observation_space: spaces.Space, action_space: spaces.Space = ACTIONS) -> None:
+        self.observation_space, self.action_space = observation_space, action_space
 
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, _info: Any) -> np.ndarray:
         """Return 1 where the goal is reached."""
@@ -128,31 +131,51 @@ class Features(BaseFeaturesExtractor):
         return self.layers(observations)
 
 
-def make_ddpg(rows: int, *, downsample: str, learning_rate: float, discount: float, target_rate: float) -> DDPG:
-    """Return DDPG with our networks, its own for each of actor and critic, on a buffer of images 64x64."""
-    model = DDPG(
+def make_model(
+    algorithm: type[OffPolicyAlgorithm], actions: spaces.Space, rows: TensorDict, config: HindsightConfig, rate: float
+) -> OffPolicyAlgorithm:
+    """Return an algorithm with our networks, on a buffer filled with rows of images 64x64."""
+    model = algorithm(
         "CnnPolicy",
-        DummyVecEnv([partial(Still, images(64))]),
-        learning_rate=learning_rate,
-        buffer_size=rows,
-        tau=target_rate,
-        gamma=discount,
+        DummyVecEnv([partial(Still, images(64), actions)]),
+        learning_rate=rate,
+        buffer_size=len(rows),
+        tau=config.target_rate,
+        gamma=config.discount,
         device="cpu",
         policy_kwargs={
             "features_extractor_class": Features,
-            "features_extractor_kwargs": {"downsample": downsample},
-            "share_features_extractor": False,
+            "features_extractor_kwargs": {"downsample": config.downsample},
             "net_arch": [32],
             "activation_fn": partial(nn.LeakyReLU, LEAK),
         },
     )
     model.set_logger(Logger(folder=None, output_formats=[]))
+    fill(model.replay_buffer, rows)
     return model
 
 
-def make_update(rows: TensorDict, batch_size: int, **options: Any) -> tuple[Callable[[], object], tuple[int, int]]:
-    """Return an update of DDPG, and the numbers of parameters of actor and critic."""
-    model = make_ddpg(len(rows), **options)
-    fill(model.replay_buffer, rows)
-    counts = tuple(sum(p.numel() for p in network.parameters()) for network in (model.actor, model.critic))
-    return partial(model.train, gradient_steps=1, batch_size=batch_size), counts
+Update = Callable[[], object]
+
+
+def make_ddpg_update(rows: TensorDict, config: HindsightConfig, rate: float) -> tuple[Update, tuple[int, ...]]:
+    """Return an update of DDPG, and the numbers of parameters of actor and critic, each with its own convolutions."""
+    model = make_model(DDPG, ACTIONS, rows, config, rate)
+    return partial(model.train, gradient_steps=1, batch_size=config.batch_size), _counts(model.actor, model.critic)
+
+
+def make_dqn_update(rows: TensorDict, config: HindsightConfig, rate: float) -> tuple[Update, tuple[int, ...]]:
+    """Return an update of DQN and of its target, and the number of parameters; the rows' actions are one-hot."""
+    choices = spaces.Discrete(rows["action"].shape[-1])
+    rows = rows.clone(False).set("action", rows["action"].argmax(-1, keepdim=True))
+    model = make_model(DQN, choices, rows, config, rate)
+
+    def update() -> None:
+        model.train(gradient_steps=1, batch_size=config.batch_size)
+        polyak_update(model.q_net.parameters(), model.q_net_target.parameters(), model.tau)
+
+    return update, _counts(model.q_net)
+
+
+def _counts(*networks: nn.Module) -> tuple[int, ...]:
+    return tuple(sum(parameter.numel() for parameter in network.parameters()) for network in networks)

@@ -1,21 +1,27 @@
-"""DDPG updates a second, beside Stable-Baselines3 and TorchRL's plain loop: same networks and batch, no hindsight.
+"""DDPG and DDQN updates a second, beside Stable-Baselines3 and TorchRL's plain loop: same networks, no hindsight.
 
 Usage::
 
     python -m benchmarks.updates
 
-Ours is the recipe's update: sampling from a ``FrameStorage``, TorchRL's loss with clipped targets and the price on the
-actor's pre-activations, one fused Adam, images and convolutions in ``channels_last``. Stable-Baselines3's is
-``DDPG.train`` with our convolutions as features extractor, one for each of actor and critic (it has one learning rate
-for both). TorchRL's is ``DDPGLoss``, two Adams and ``SoftUpdate`` on a ``LazyTensorStorage`` of images channels first.
-Both peers' networks are in PyTorch's default memory format; the numbers of parameters are compared before measuring.
-One thread, medians of processor time in alternating rounds.
+Ours is the recipe's update: sampling from a ``FrameStorage``, TorchRL's loss with clipped targets (and, in DDPG, the
+price on the actor's pre-activations), one fused Adam, images and convolutions in ``channels_last``. Stable-Baselines3's
+is ``DDPG.train`` or ``DQN.train`` with our convolutions as features extractor, in DDPG one for each of actor and critic
+(it has one learning rate for both). TorchRL's is ``DDPGLoss`` or ``DQNLoss``, an Adam for each network and
+``SoftUpdate`` on a ``LazyTensorStorage`` of images channels first. Both peers' networks are in PyTorch's default memory
+format; the numbers of parameters are compared before measuring. One thread, medians of processor time in alternating
+rounds.
+
+Stable-Baselines3's DQN is not double: it does not ask the online network about next frames, one forward pass less. So
+ours is measured without that pass as well ("ours, not double"). Its ``train`` leaves the target network to the steps in
+the environment; here the target network follows at each update, as in the others.
 """
 
 import dataclasses
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
+from typing import Any
 
 import torch
 import tyro
@@ -23,26 +29,29 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl import logger as torchrl_logger
-from torchrl.data import Bounded, LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
+from torchrl.data import Bounded, LazyTensorStorage, OneHot, TensorDictReplayBuffer, TensorSpec
+from torchrl.objectives import DDPGLoss, DQNLoss, LossModule, SoftUpdate, ValueEstimators
 
 from benchmarks import sb3_peers
 from benchmarks.rounds import alternate, seconds_a_call, warm_heap
 from benchmarks.rows import Rows, channels_first, plain
 from benchmarks.tables import Table, report
-from halgan_rl.ddpg import make_agent
-from halgan_rl.experiment import make_buffer
-from halgan_rl.models.agents import Actor, Critic, Downsample
-from recipes.ddpg_navigate import Config
+from halgan_rl import ddpg, ddqn
+from halgan_rl.experiment import HindsightConfig, make_buffer
+from halgan_rl.models.agents import Actor, Critic, Downsample, QNetwork, Vision, greedy_policy
+from halgan_rl.training import Agent
+from recipes import ddpg_navigate, ddqn_pebble
 
 Update = Callable[[], object]
 Counts = tuple[int, ...]
-"""Numbers of parameters of actor and critic."""
+"""Numbers of parameters of actor and critic, or of the one network of action values."""
+Variant = Callable[[Any, TensorDict], tuple[Update, Counts]]
+"""Makes an update for a recipe's configuration and the rows of a buffer."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Benchmark:
-    """DDPG updates a second, side by side."""
+    """Updates a second, side by side."""
 
     rounds: int = 7
     """Alternating rounds; the median is reported."""
@@ -53,49 +62,80 @@ class Benchmark:
     batch_sizes: tuple[int, ...] = (32, 128)
     """Rows an update."""
     downsamples: tuple[Downsample, ...] = ("stride", "max_pool")
-    """How the convolutions halve the image, in all three."""
+    """How the convolutions halve the image, in all of them."""
 
 
-def ours(config: Config, rows: TensorDict) -> tuple[Update, Counts]:
+def ours(
+    make_agent: Callable[[Any, TensorSpec], Agent], actions: TensorSpec, config: HindsightConfig, rows: TensorDict
+) -> tuple[Update, Counts]:
     """Return the recipe's update, and the numbers of parameters."""
     buffer = make_buffer(config, None)
     buffer.extend(plain(rows))
-    agent = make_agent(config, Bounded(-1.0, 1.0, (2,)))
-    return lambda: agent.update(buffer.sample()), count_parameters(agent.network, agent.loss.value_network)
+    agent = make_agent(config, actions)
+    return lambda: agent.update(buffer.sample()), count_parameters(agent.loss)
 
 
-class ContiguousActor(Actor):
-    """Our actor on images uint8 ``[N, 3, 64, 64]``, in PyTorch's default memory format."""
+def make_single_dqn(config: ddqn.DDQNConfig, actions: TensorSpec) -> Agent:
+    """Return the recipe's agent, with targets that are not double."""
+    agent = ddqn.make_agent(config, actions)
+    agent.loss.double_dqn = False
+    agent.loss.value_estimator.set_keys(value=agent.loss.tensor_keys.value)  # which it now asks for itself
+    return agent
+
+
+class ContiguousVision(Vision):
+    """Our convolutions on images uint8 ``[N, 3, 64, 64]``, in PyTorch's default memory format."""
+
+    def __init__(self, downsample: Downsample) -> None:
+        super().__init__(downsample)
+        self.to(memory_format=torch.contiguous_format)
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """Return actions ``[N, A]``."""
-        return self.head(self.vision.layers(pixels.float() / 127.5 - 1)).tanh()
+        """Return features ``[N, 512]``."""
+        return self.layers(pixels.float() / 127.5 - 1)
 
 
-class ContiguousCritic(Critic):
-    """Our critic on images uint8 ``[N, 3, 64, 64]``, in PyTorch's default memory format."""
-
-    def forward(self, pixels: Tensor, action: Tensor) -> Tensor:
-        """Return values ``[N, 1]``."""
-        return self.head(torch.cat([self.vision.layers(pixels.float() / 127.5 - 1), action], -1))
+def contiguous(network: nn.Module, config: HindsightConfig) -> nn.Module:
+    """Return one of our networks, changed to images channels first."""
+    network.vision = ContiguousVision(config.downsample)
+    return network
 
 
-def torchrl_loop(config: Config, rows: TensorDict) -> tuple[Update, Counts]:
+LearningRates = list[tuple[TensorDict, float]]
+"""Parameters, and the learning rate of their Adam."""
+
+
+def torchrl_ddpg(config: ddpg.DDPGConfig) -> tuple[LossModule, LearningRates]:
+    """Return TorchRL's loss on our actor and critic, channels first."""
+    actor, critic = contiguous(Actor(), config), contiguous(Critic(), config)
+    loss = DDPGLoss(
+        TensorDictModule(nn.Sequential(actor, nn.Tanh()), in_keys=["pixels"], out_keys=["action"]),
+        TensorDictModule(critic, in_keys=["pixels", "action"], out_keys=["state_action_value"]),
+        delay_actor=True,
+        delay_value=True,
+    )
+    rates = (config.actor_learning_rate, config.critic_learning_rate)
+    return loss, list(zip((loss.actor_network_params, loss.value_network_params), rates, strict=True))
+
+
+def torchrl_ddqn(config: ddqn.DDQNConfig) -> tuple[LossModule, LearningRates]:
+    """Return TorchRL's loss on our network of action values, channels first."""
+    values = greedy_policy(contiguous(QNetwork(), config))
+    loss = DQNLoss(values, delay_value=True, double_dqn=True, action_space="one_hot")
+    return loss, [(loss.value_network_params, config.learning_rate)]
+
+
+def torchrl_loop(
+    make_loss: Callable[[Any], tuple[LossModule, LearningRates]], config: HindsightConfig, rows: TensorDict
+) -> tuple[Update, Counts]:
     """Return TorchRL's plain update, and the numbers of parameters."""
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(len(rows)), batch_size=config.batch_size)
     buffer.extend(plain(rows).update({"pixels": channels_first(rows["pixels"])}).update(_next_channels_first(rows)))
-    networks = ContiguousActor(downsample=config.downsample), ContiguousCritic(downsample=config.downsample)
-    nets: list[nn.Module] = [network.to(memory_format=torch.contiguous_format) for network in networks]
-    actor = TensorDictModule(nets[0], in_keys=["pixels"], out_keys=["action"])
-    critic = TensorDictModule(nets[1], in_keys=["pixels", "action"], out_keys=["state_action_value"])
-    loss = DDPGLoss(actor, critic, delay_actor=True, delay_value=True)
+    loss, rates = make_loss(config)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=config.discount)
-    optimizers = [
-        torch.optim.Adam(loss.actor_network_params.values(True, True), lr=config.actor_learning_rate),
-        torch.optim.Adam(loss.value_network_params.values(True, True), lr=config.critic_learning_rate),
-    ]
+    optimizers = [torch.optim.Adam(parameters.values(True, True), lr=rate) for parameters, rate in rates]
     target_updater = SoftUpdate(loss, tau=config.target_rate)
-    return partial(_torchrl_update, buffer, loss, optimizers, target_updater), count_parameters(actor, critic)
+    return partial(_torchrl_update, buffer, loss, optimizers, target_updater), count_parameters(loss)
 
 
 def _next_channels_first(rows: TensorDict) -> dict[str, dict[str, Tensor]]:
@@ -103,63 +143,112 @@ def _next_channels_first(rows: TensorDict) -> dict[str, dict[str, Tensor]]:
 
 
 def _torchrl_update(
-    buffer: TensorDictReplayBuffer, loss: DDPGLoss, optimizers: list[torch.optim.Adam], target_updater: SoftUpdate
+    buffer: TensorDictReplayBuffer, loss: LossModule, optimizers: list[torch.optim.Adam], target_updater: SoftUpdate
 ) -> None:
     losses = loss(buffer.sample())
-    (losses["loss_actor"] + losses["loss_value"]).backward()
+    sum(value for name, value in losses.items() if name.startswith("loss")).backward()
     for optimizer in optimizers:
         optimizer.step()
         optimizer.zero_grad()
     target_updater.step()
 
 
-def sb3(config: Config, rows: TensorDict) -> tuple[Update, Counts]:
+def sb3_ddpg(config: ddpg.DDPGConfig, rows: TensorDict) -> tuple[Update, Counts]:
     """Return Stable-Baselines3's update, and the numbers of parameters."""
-    return sb3_peers.make_update(
-        rows,
-        config.batch_size,
-        downsample=config.downsample,
-        learning_rate=config.critic_learning_rate,
-        discount=config.discount,
-        target_rate=config.target_rate,
-    )
+    return sb3_peers.make_ddpg_update(rows, config, config.critic_learning_rate)
 
 
-def count_parameters(*networks: nn.Module) -> Counts:
-    """Return the number of parameters of each."""
-    return tuple(sum(parameter.numel() for parameter in network.parameters()) for network in networks)
+def sb3_dqn(config: ddqn.DDQNConfig, rows: TensorDict) -> tuple[Update, Counts]:
+    """Return Stable-Baselines3's update, which is not double, and the numbers of parameters."""
+    return sb3_peers.make_dqn_update(rows, config, config.learning_rate)
 
 
-VARIANTS = {"ours": ours, "SB3 DDPG.train": sb3, "torchrl plain loop": torchrl_loop}
+def count_parameters(loss: LossModule) -> Counts:
+    """Return the number of parameters of each network that a loss trains."""
+    networks = [getattr(loss, f"{name}_network_params", None) for name in ("actor", "value")]
+    return tuple(sum(p.numel() for p in network.values(True, True)) for network in networks if network is not None)
 
 
-def make_updates(config: Config, rows: TensorDict) -> dict[str, Update]:
-    """Return an update of each; their networks have the same numbers of parameters.
+@dataclasses.dataclass(frozen=True)
+class Algorithm:
+    """What is measured of an algorithm.
+
+    Attributes:
+        config: the recipe's.
+        actions: of its environment.
+        variants: ours and its peers.
+    """
+
+    config: HindsightConfig
+    actions: TensorSpec
+    variants: Mapping[str, Variant]
+
+
+DRIVE, CHOICE = Bounded(-1.0, 1.0, (2,)), OneHot(4, dtype=torch.int64)
+ALGORITHMS = {
+    "DDPG": Algorithm(
+        ddpg_navigate.Config(hindsight="none"),
+        DRIVE,
+        {
+            "ours": partial(ours, ddpg.make_agent, DRIVE),
+            "SB3 DDPG.train": sb3_ddpg,
+            "torchrl plain loop": partial(torchrl_loop, torchrl_ddpg),
+        },
+    ),
+    "DDQN": Algorithm(
+        ddqn_pebble.Config(hindsight="none"),
+        CHOICE,
+        {
+            "ours": partial(ours, ddqn.make_agent, CHOICE),
+            "ours, not double": partial(ours, make_single_dqn, CHOICE),
+            "SB3 DQN.train, not double": sb3_dqn,
+            "torchrl plain loop": partial(torchrl_loop, torchrl_ddqn),
+        },
+    ),
+}
+
+
+def make_updates(algorithm: Algorithm, rows: TensorDict, **changes: Any) -> dict[str, Update]:
+    """Return an update of each variant; their networks have the same numbers of parameters.
+
+    Args:
+        algorithm: what to measure.
+        rows: what to fill the buffers with; actions are drawn anew.
+        changes: of the recipe's configuration.
 
     Raises:
-        RuntimeError: if they do not.
+        RuntimeError: if the numbers differ.
     """
-    made = {name: variant(config, rows) for name, variant in VARIANTS.items()}
+    config = dataclasses.replace(algorithm.config, replay_capacity=len(rows), **changes)
+    rows = rows.clone(False).set("action", algorithm.actions.rand((len(rows),)))
+    made = {name: variant(config, rows) for name, variant in algorithm.variants.items()}
     counts = {name: parameters for name, (_, parameters) in made.items()}
     if len(set(counts.values())) != 1:
         raise RuntimeError(f"the networks differ, this would compare apples with pears: {counts}")
     return {name: run for name, (run, _) in made.items()}
 
 
-Case = tuple[str, int, str]
-"""Down-sampling, batch size, variant."""
+Case = tuple[str, str, int, str]
+"""Algorithm, down-sampling, batch size, variant."""
 
 
 def measure(benchmark: Benchmark) -> dict[Case, float]:
     """Return medians of the time of an update [s], all taken by turns."""
     rows = Rows(64).take(benchmark.rows)
-    default = Config(hindsight="none", replay_capacity=benchmark.rows)
     measures = {}
-    for downsample, size in itertools.product(benchmark.downsamples, benchmark.batch_sizes):
-        config = dataclasses.replace(default, batch_size=size, downsample=downsample)
-        for name, run in make_updates(config, rows).items():
-            measures[downsample, size, name] = partial(seconds_a_call, run, benchmark.updates)
+    for (algorithm, made), *options in itertools.product(
+        ALGORITHMS.items(), benchmark.downsamples, benchmark.batch_sizes
+    ):
+        downsample, size = options
+        for name, run in make_updates(made, rows, batch_size=size, downsample=downsample).items():
+            measures[algorithm, downsample, size, name] = partial(seconds_a_call, run, benchmark.updates)
     return alternate(measures, benchmark.rounds)
+
+
+HEADER = (
+    *("algorithm", "networks", "batch", "variant", "ms an update", "updates/s"),
+    *("ours, same networks", "ours, strides"),
+)
 
 
 def main(benchmark: Benchmark) -> None:
@@ -170,16 +259,15 @@ def main(benchmark: Benchmark) -> None:
     warm_heap()
     seconds = measure(benchmark)
     title = (
-        f"DDPG updates, one thread, medians of {benchmark.rounds} alternating rounds of {benchmark.updates}, processor "
+        f"Updates, one thread, medians of {benchmark.rounds} alternating rounds of {benchmark.updates}, processor "
         "time. The factors tell how many times as fast ours is: with the same networks, and with strides."
     )
-    header = ("networks", "batch", "variant", "ms an update", "updates/s", "ours, same networks", "ours, strides")
     lines = [
-        [downsample, str(size), name, f"{value * 1e3:.1f}", f"{1 / value:.0f}"]
-        + [f"{value / seconds[other, size, 'ours']:.2f}" for other in (downsample, benchmark.downsamples[0])]
-        for (downsample, size, name), value in seconds.items()
+        [algorithm, downsample, str(size), name, f"{value * 1e3:.1f}", f"{1 / value:.0f}"]
+        + [f"{value / seconds[algorithm, other, size, 'ours']:.2f}" for other in (downsample, benchmark.downsamples[0])]
+        for (algorithm, downsample, size, name), value in seconds.items()
     ]
-    report("updates", [Table(title, header, lines)])
+    report("updates", [Table(title, HEADER, lines)])
 
 
 if __name__ == "__main__":

@@ -1,7 +1,9 @@
+import dataclasses
 import json
 
 import pytest
 import torch
+from torch.nn.modules.module import register_module_forward_hook
 
 pytest.importorskip("stable_baselines3", reason="the peers live in an environment of their own: make bench")
 
@@ -9,7 +11,9 @@ from benchmarks import replay, sb3_peers, update_cost, updates
 from benchmarks.rounds import alternate
 from benchmarks.rows import EPISODE, Rows, channels_first, plain
 from benchmarks.tables import Table, report
+from halgan_rl import ddqn
 from halgan_rl.frame_storage import FrameStorage
+from halgan_rl.models.agents import Vision
 
 TINY = replay.Benchmark(rounds=1, calls=1)
 
@@ -39,16 +43,30 @@ def test_replay_compares_every_buffer_at_every_size():
     assert {len(line) for line in lines} == {len(replay.HEADER)}
 
 
-def test_updates_run_on_networks_of_the_same_size():
-    config = updates.Config(hindsight="none", replay_capacity=EPISODE)
-    for run in updates.make_updates(config, Rows(64).take(EPISODE)).values():
+@pytest.mark.parametrize("algorithm", updates.ALGORITHMS.values(), ids=updates.ALGORITHMS)
+def test_updates_run_on_networks_of_the_same_size(algorithm):
+    for run in updates.make_updates(algorithm, Rows(64).take(EPISODE)).values():
         run()
 
 
-def test_different_networks_are_refused(monkeypatch):
-    monkeypatch.setitem(updates.VARIANTS, "ours", lambda config, rows: (lambda: None, (1, 2)))
+@pytest.mark.parametrize("algorithm", updates.ALGORITHMS.values(), ids=updates.ALGORITHMS)
+def test_different_networks_are_refused(algorithm):
+    other = {"ours": lambda config, rows: (lambda: None, (1, 2))}
+    changed = dataclasses.replace(algorithm, variants={**algorithm.variants, **other})
     with pytest.raises(RuntimeError, match="the networks differ"):
-        updates.make_updates(updates.Config(hindsight="none"), Rows(64).take(EPISODE))
+        updates.make_updates(changed, Rows(64).take(EPISODE))
+
+
+@pytest.mark.parametrize(("make_agent", "passes"), [(ddqn.make_agent, 3), (updates.make_single_dqn, 2)])
+def test_a_double_update_asks_a_network_once_more(make_agent, passes):
+    config = dataclasses.replace(updates.ALGORITHMS["DDQN"].config, replay_capacity=EPISODE)
+    rows = Rows(64).take(EPISODE)
+    rows["action"] = updates.CHOICE.rand((EPISODE,))
+    run, _ = updates.ours(make_agent, updates.CHOICE, config, rows)
+    asked = []
+    with register_module_forward_hook(lambda module, *_: asked.append(type(module))):
+        run()
+    assert asked.count(Vision) == passes
 
 
 def test_the_cost_of_hindsight_is_measured_on_the_recipes_update():
