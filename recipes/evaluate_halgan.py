@@ -161,7 +161,10 @@ def mask_overlaps(
 def consistency(
     probe: PoseProbe, config: Config, renderer: envs.GoalRenderer, painter: Hallucinator
 ) -> dict[str, float]:
-    """Return how far the goal seems to wander in the room while the robot moves [m], the root mean square."""
+    """Return how far the goal seems to wander in the room while the robot moves [m], the root mean square.
+
+    NaN if no goal stays in view for long enough.
+    """
     squares: dict[str, list[Tensor]] = {"real": [], "truth": [], "hallucinated": []}
     for stretch in stretches(near_goal(config, config.frames, config.seed + 2)):
         empty = without_goal(stretch, renderer)
@@ -173,7 +176,7 @@ def consistency(
         for label, frames in images.items():
             seen = in_room(stretch["pose"], probe_all(probe, frames))
             squares[label].append((seen - seen.mean(0)).square().sum(-1).mean())
-    return {label: float(torch.stack(values).mean().sqrt()) for label, values in squares.items()}
+    return {label: float(torch.tensor(values).mean().sqrt()) for label, values in squares.items()}
 
 
 def stretches(data: dict[str, Tensor]) -> list[dict[str, Tensor]]:
@@ -208,8 +211,9 @@ def draw_failures(config: Config, renderer: envs.GoalRenderer, rng: torch.Genera
     pose = torch.from_numpy(
         envs.collect_failed(environment, 10 * config.frames, np.random.RandomState(config.seed + 3))["pose"]
     )
+    step = environment.task.robot.max_speed * environment.task.control_timestep
     environment.close()
-    jumps = (pose[1:, :2] - pose[:-1, :2]).norm(dim=-1) > 0.1  # from the end of a walk to the start of the next
+    jumps = (pose[1:, :2] - pose[:-1, :2]).norm(dim=-1) > max(0.1, 1.1 * step)  # between the end of a walk and the next
     walk = torch.cat([torch.zeros(1), jumps.cumsum(0)])
     start = torch.randint(len(pose), (40 * config.frames,), generator=rng)
     ahead = (start + 1 + (torch.rand(len(start), generator=rng).square() * 96).long()).clamp(max=len(pose) - 1)

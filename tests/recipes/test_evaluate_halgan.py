@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,14 @@ def test_the_shipped_weights_are_near_the_truth(bank: bool, tmp_path: Path, caps
     assert set(report["consistency"]) == {"real", "truth", "hallucinated"}
     assert (tmp_path / "report" / "fidelity.png").stat().st_size > 1000
     assert "mask overlap" in capsys.readouterr().out
+
+
+def test_goals_that_never_stay_in_view_have_no_scatter_and_all_else(tmp_path: Path) -> None:
+    main(dataclasses.replace(TINY, environment="pebble", out=tmp_path / "report"))
+    report = json.loads((tmp_path / "report" / "fidelity.json").read_text())
+    assert all(math.isnan(value) for value in report["consistency"].values())
+    assert report["mask"]["within 1 m"]["frames"] > 0
+    assert report["no_op"]["out_of_view"] < 1
 
 
 def test_nobody_s_painting_is_no_overlap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
