@@ -19,7 +19,7 @@ Differences from the paper, besides those numbered in ``ddpg_navigate.py``, all 
 
 1. Which box is painted, the row's ``held`` flag tells. (The authors draw it at random.)
 2. One update every 2 frames instead of every frame.
-3. Relabelling decays over 300,000 frames, epsilon to 0.1 over 50,000.
+3. Relabelling decays over 300,000 frames, epsilon to 0.4 over 33,000.
 """
 
 import dataclasses
@@ -43,9 +43,9 @@ class Config(DDPGConfig):
     """Folder of the run; must not hold one yet."""
     frames_per_update: int = 2
     """Environment steps for each update."""
-    epsilon_end: float = 0.1
+    epsilon_end: float = 0.4
     """Share of uniformly random actions at the end."""
-    epsilon_frames: int = 50_000
+    epsilon_frames: int = 33_000
     """Frames over which the share falls."""
     hallucination_frames: int = 300_000
     """Frames over which the probability falls."""

@@ -9,7 +9,13 @@ Usage::
 
 The run's folder and metrics are those of ``ddpg_navigate.py``, but for ``train/loss`` instead of the losses of actor
 and critic. Differences from the paper, all undone by ``--preset paper``: those numbered in ``ddpg_navigate.py`` that
-concern strides, discount, targets, near goals, exploration, relabelling, the average policy and the bank.
+concern strides, discount, targets, exploration, the average policy and the bank, and two more:
+
+1. Half of the sampled rows are relabelled at first, instead of a fifth; their share decays over 60,000 frames.
+2. Goals up to 32 steps ahead instead of 16, so that the pebble is also seen from afar. (No preference for near ones.)
+
+What the four actions do, which the paper does not tell, decides whether a greedy agent searches or dithers: see
+``envs/robots/turtlebot.py``.
 """
 
 import dataclasses
@@ -31,8 +37,12 @@ class Config(DDQNConfig):
     """Environment steps."""
     out: Path = Path("runs/ddqn_pebble")
     """Folder of the run; must not hold one yet."""
-    max_distance: int = 48
+    hallucination_start: float = 0.5
+    """Probability that a sampled row is relabelled, at the start."""
+    max_distance: int = 32
     """Longest failed snippet: the goal lies 1 to this many steps ahead."""
+    nearness: float = 1.0
+    """Preference for near goals: the steps to the goal are uniform to this power; 1 is uniform."""
     epsilon_end: float = 0.1
     """Share of uniformly random actions at the end."""
 
