@@ -5,7 +5,7 @@ import dataclasses
 import torch
 from tensordict.nn import TensorDictSequential
 from torchrl.data import OneHot, TensorSpec
-from torchrl.modules import EGreedyModule, QValueActor
+from torchrl.modules import EGreedyModule
 from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
 
 from halgan_rl.experiment import HindsightConfig
@@ -49,7 +49,7 @@ def make_agent(config: DDQNConfig, action_spec: TensorSpec) -> Agent:
     )
 
 
-def make_loss(config: DDQNConfig, actor: QValueActor) -> DQNLoss:
+def make_loss(config: DDQNConfig, actor: TensorDictSequential) -> DQNLoss:
     """Return TorchRL's double-DQN loss with the targets that the configuration asks for."""
     loss = DQNLoss(actor, delay_value=True, double_dqn=True, action_space="one_hot")
     if config.clip_targets:

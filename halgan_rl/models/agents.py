@@ -6,7 +6,7 @@ import torch
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
-from torchrl.modules import QValueActor
+from torchrl.modules import QValueModule
 
 from halgan_rl.models.halgan import LEAK
 from halgan_rl.models.pixels import to_float
@@ -158,7 +158,18 @@ class QNetwork(nn.Module):
         return self.head(self.vision(pixels)).reshape(*pixels.shape[:-3], -1)
 
 
-def greedy_policy(network: QNetwork, *, pixels_key: NestedKey = "pixels") -> QValueActor:
+class FirstBest(QValueModule):
+    """TorchRL's choice of the best action, one-hot; of several whose values are the same to the last bit, the first.
+
+    TorchRL's own marks all of them (0.14.1), which is no action: it ended a training after 20,000 frames.
+    """
+
+    @staticmethod
+    def _one_hot(value: Tensor) -> Tensor:
+        return nn.functional.one_hot(value.argmax(-1), value.shape[-1])
+
+
+def greedy_policy(network: QNetwork, *, pixels_key: NestedKey = "pixels") -> TensorDictSequential:
     """Return the policy of an action-value network: reads images, writes the best action, one-hot, and all values.
 
     Args:
@@ -171,7 +182,9 @@ def greedy_policy(network: QNetwork, *, pixels_key: NestedKey = "pixels") -> QVa
         >>> greedy_policy(QNetwork())(TensorDict({"pixels": images}, batch_size=[5]))["action"].shape
         torch.Size([5, 4])
     """
-    return QValueActor(network, in_keys=[pixels_key], action_space="one_hot")
+    return TensorDictSequential(
+        TensorDictModule(network, in_keys=[pixels_key], out_keys=["action_value"]), FirstBest(action_space="one_hot")
+    )
 
 
 def _head(inputs: int, outputs: int) -> nn.Sequential:

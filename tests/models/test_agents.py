@@ -2,8 +2,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
+from torchrl.objectives import DQNLoss
 
-from halgan_rl.models.agents import Actor, Critic, Downsample, QNetwork, deterministic_policy
+from halgan_rl.models.agents import Actor, Critic, Downsample, QNetwork, deterministic_policy, greedy_policy
 
 NETWORKS = {"actor": (Actor, 33_642), "critic": (Critic, 33_673), "ddqn": (QNetwork, 33_708)}
 
@@ -79,3 +80,22 @@ def test_images_of_another_layout_or_type_are_refused(pixels: Tensor) -> None:
 def test_an_unknown_downsampling_is_refused() -> None:
     with pytest.raises(ValueError, match="average"):
         Actor(downsample="average")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("double", [True, False])
+def test_of_equally_good_actions_the_first_is_chosen_and_valued_once(double: bool) -> None:
+    network = QNetwork(actions=3)
+    with torch.no_grad():
+        network.head[-1].weight.zero_()
+        network.head[-1].bias.copy_(torch.tensor([0.1, 0.4, 0.4]))
+    policy = greedy_policy(network)
+    pixels = torch.zeros(2, 64, 64, 3, dtype=torch.uint8)
+    chosen = policy(TensorDict({"pixels": pixels}, batch_size=[2]))
+    assert chosen["action"].tolist() == [[0, 1, 0]] * 2
+    loss = DQNLoss(policy, delay_value=True, double_dqn=double, action_space="one_hot")
+    loss.make_value_estimator(gamma=0.5)
+    going_on = torch.zeros(2, 1, dtype=torch.bool)
+    after = {"pixels": pixels, "reward": torch.zeros(2, 1), "done": going_on, "terminated": going_on}
+    rows = TensorDict({"pixels": pixels, "action": chosen["action"], "next": after}, batch_size=[2])
+    expected = nn.functional.mse_loss(torch.tensor(0.4), 0.5 * torch.tensor(0.4))
+    torch.testing.assert_close(loss(rows)["loss"].detach(), expected)
