@@ -1,6 +1,6 @@
-"""Steps and frames a second of the environment, beside dm_control's stock camera in the same scene.
+"""Steps and frames a second of the environments, beside dm_control's stock camera in the same scene.
 
-Usage: python -m benchmarks.env_speed [--name navigate-2m] [--steps 500] [--rounds 5]
+Usage: python -m benchmarks.env_speed [--names navigate-2m pebble] [--steps 500] [--rounds 5]
 
 Every measurement runs in a process of its own (OpenGL contexts of different kinds do not mix), the variants by turns,
 so that what else the machine does falls on all of them. The table shows medians, by wall time and by processor time,
@@ -54,6 +54,8 @@ def stock_camera(name: str, steps: int) -> Callable[[], None]:
     return stepping(Environment(task, time_limit=20.0, random_state=0), steps)
 
 
+TASKS = ("navigate-2m", "pick-and-place-2m", "pebble")
+"""One environment of each task."""
 VARIANTS = {
     "bare renderer": bare_renderer,
     "ours, composer": composer,
@@ -87,7 +89,7 @@ def measure(variant: str, name: str, steps: int) -> tuple[float, float]:
 
 def measure_elsewhere(variant: str, name: str, steps: int) -> tuple[float, float]:
     """The same in a process of its own."""
-    flags = {"--name": name, "--steps": str(steps), "--variant": variant}
+    flags = {"--names": name, "--steps": str(steps), "--variant": variant}
     command = [sys.executable, "-m", "benchmarks.env_speed", *(part for flag in flags.items() for part in flag)]
     output = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
     wall, processor = output.split()[-2:]
@@ -97,19 +99,22 @@ def measure_elsewhere(variant: str, name: str, steps: int) -> tuple[float, float
 def main() -> None:
     """Reads the command line and prints a table, or one number for ``--variant``."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--name", default="navigate-2m", choices=sorted(envs.NAMES), help="which environment")
+    parser.add_argument("--names", nargs="+", default=TASKS, choices=sorted(envs.NAMES), help="which environments")
     parser.add_argument("--steps", default=500, type=int, help="steps a measurement")
     parser.add_argument("--rounds", default=5, type=int, help="measurements a variant")
-    parser.add_argument("--variant", choices=list(VARIANTS), help="measure only this one, here, and print its number")
+    parser.add_argument("--variant", choices=list(VARIANTS), help="measure only this one, in the first of them, here")
     flags = parser.parse_args()
     if flags.variant:
-        print(*measure(flags.variant, flags.name, flags.steps))
+        print(*measure(flags.variant, flags.names[0], flags.steps))
         return
-    results: dict[str, list[tuple[float, float]]] = {variant: [] for variant in VARIANTS}
-    for _ in range(flags.rounds):
-        for variant, values in results.items():
-            values.append(measure_elsewhere(variant, flags.name, flags.steps))
-    report("env_speed", [make_table(flags.name, results)])
+    tables = []
+    for name in flags.names:
+        results: dict[str, list[tuple[float, float]]] = {variant: [] for variant in VARIANTS}
+        for _ in range(flags.rounds):
+            for variant, values in results.items():
+                values.append(measure_elsewhere(variant, name, flags.steps))
+        tables.append(make_table(name, results))
+    report("env_speed", tables)
 
 
 def make_table(name: str, results: dict[str, list[tuple[float, float]]]) -> Table:
