@@ -110,7 +110,7 @@ def test_discrete_actions_that_are_not_one_hot_are_refused(pebble_env, action):
         pebble_env.step(TensorDict({"action": torch.tensor(action)}, []))
 
 
-@pytest.mark.parametrize(("motion", "moved"), [(0, 0.1), (3, 0.04)])
+@pytest.mark.parametrize(("motion", "moved"), [(0, 0.1), (3, 0.16)])
 def test_the_place_of_the_one_tells_the_motion(pebble_env, motion, moved):
     action = TensorDict({"action": torch.eye(4, dtype=torch.int64)[motion]}, [])
     pebble_env.environment.reset_to({"pose": (0.0, 0.3, 0.0), "pebble": (2.0, -0.5)})
