@@ -64,13 +64,7 @@ def warm_start(
         raise ValueError(f"latent_noise={latent_noise} must be within [0, 1]: it is a share")
     frames, encoding = near_goal["pixels"], generator.encoding
     labels = encoding.labels(near_goal["pose"], near_goal["goal_pose"])
-    flags, failed_flags = matching_flags(near_goal, failed)
-    is_goal = torch.stack(
-        [
-            goal_colours(frames[flags == setting], failed["pixels"][failed_flags == setting])
-            for setting in range(int(flags.max()) + 1)
-        ]
-    )
+    flags, is_goal = _goal_colours_by_flags(near_goal, failed)
     rollouts = torch.unique(near_goal["goal_pose"], dim=0, return_inverse=True)[1]
     count = int(rollouts.max()) + 1
     latents = nn.Parameter(torch.randn(2 * count, generator.latent_size, generator=rng))  # the second half for mirrored
@@ -95,6 +89,16 @@ def warm_start(
         optimizer.step()
         schedule.step()
         yield float(loss.detach())
+
+
+def _goal_colours_by_flags(near_goal: Frames, failed: Frames) -> tuple[Tensor, Tensor]:
+    """Return the number of each near-goal frame's flags ``[N]``, and which colours are the goal's, for each number."""
+    flags, failed_flags = matching_flags(near_goal, failed)
+    pairs = (
+        (near_goal["pixels"][flags == number], failed["pixels"][failed_flags == number])
+        for number in range(int(flags.max()) + 1)
+    )
+    return flags, torch.stack([goal_colours(*pair) for pair in pairs])
 
 
 def goal_colours(near_goal_pixels: Tensor, failed_pixels: Tensor, *, ratio: float = 4.0) -> Tensor:
