@@ -10,8 +10,9 @@ Collecting, all together, bounds what collecting at the same time as learning co
 moving average of the weights, and the figures; files and pictures are left out. One thread, medians of processor time
 in alternating rounds.
 
-Evaluation is spread over the frames between two of them. The agent of a benchmark is untrained, its episodes run out
-of time; they are counted at a share of that, for over a training they get shorter.
+Evaluation is done at once here, not beside training, and spread over the frames between two of them. The agent of a
+benchmark is untrained, its episodes run out of time; they are counted at a share of that, for over a training they get
+shorter.
 """
 
 import dataclasses
@@ -32,7 +33,7 @@ import envs
 from benchmarks.rounds import take_turns, warm_heap
 from benchmarks.tables import Table, report
 from envs.torchrl_env import ComposerEnv
-from halgan_rl.evaluation import evaluate
+from halgan_rl.evaluation_process import evaluate_at_once
 from halgan_rl.experiment import (
     EVALUATION_SEED,
     HindsightConfig,
@@ -41,6 +42,7 @@ from halgan_rl.experiment import (
     make_hallucinator,
     make_hindsight,
 )
+from halgan_rl.metrics import Report
 from halgan_rl.run_folder import RunFolder
 from halgan_rl.training import COLUMNS, Agent, Schedule, train
 from recipes import ddpg_navigate, ddpg_pick_place, ddqn_pebble
@@ -151,7 +153,7 @@ def make_round(recipe: Any, benchmark: Benchmark, out: Path, **changes: Any) -> 
     agent = recipe.make_agent(config, env.action_spec)
     hindsight = make_hindsight(config, hallucinator)
     buffer = make_buffer(config, hindsight)
-    collector = iter(make_collector(config, env, agent.explorer))
+    collector = iter(make_collector(config, envs, env, agent.explorer))
     while len(buffer) < benchmark.rows:
         buffer.extend(next(collector))
 
@@ -166,8 +168,8 @@ def make_round(recipe: Any, benchmark: Benchmark, out: Path, **changes: Any) -> 
         hindsight=hindsight,
         schedule=Schedule(benchmark.frames, 0, config.frames_per_update, benchmark.frames),
         policy_average=config.policy_average,
-        evaluate=watch.timed(EVALUATION, partial(evaluate, evaluation_env, seeds=starts)),
-        folder=RunFolder(out, columns=(*COLUMNS, *(f"train/{name}" for name in agent.figures.values()))),
+        evaluate=watch.timed(EVALUATION, partial(evaluate_at_once, evaluation_env, seeds=starts)),
+        report=Report(RunFolder(out, columns=(*COLUMNS, *(f"train/{name}" for name in agent.figures.values())))),
         save=lambda network: None,
         label=config.environment,
     )

@@ -5,6 +5,8 @@ Knows no simulator: the recipes pass one, see :class:`Simulator`.
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -13,17 +15,19 @@ from typing import Any, Literal, Protocol, TypeVar
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
-from torchrl.collectors import Collector
+from torchrl.collectors import AsyncCollector, BaseCollector, Collector
 from torchrl.data import TensorDictReplayBuffer, TensorSpec
-from torchrl.envs import Compose, EnvBase
+from torchrl.envs import Compose, EnvBase, ExcludeTransform
 from torchrl.record.loggers import Logger
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
 from halgan_rl import pictures, pipelines
-from halgan_rl.evaluation import evaluate, record
+from halgan_rl.evaluation import Evaluation, record
+from halgan_rl.evaluation_process import EvaluationProcess, evaluate_at_once
 from halgan_rl.frame_storage import FrameStorage
 from halgan_rl.hallucination_bank import BankGrid, HallucinationBank
 from halgan_rl.hallucinators import GanHallucinator, Hallucinator, RandomFlags
+from halgan_rl.metrics import Report
 from halgan_rl.poses import PoseTolerance
 from halgan_rl.run_folder import RunFolder, check_unused, read_metrics, versions
 from halgan_rl.training import COLUMNS, Agent, Schedule, train
@@ -81,6 +85,10 @@ class HindsightConfig:
     """Folder of the run; must not hold one yet."""
     threads: int = 1
     """Threads of PyTorch; more do not help networks this small, and change the last bits of every sum."""
+    background_evaluation: bool = True
+    """Evaluate in a process of its own, while training goes on; what is learned and measured is the same."""
+    background_collection: bool = False
+    """Collect in a process of its own, while the agent is updated: faster, but runs with one seed then differ."""
     tensorboard: bool = False
     """Also write TensorBoard logs (needs the `tensorboard` extra)."""
 
@@ -187,38 +195,39 @@ def run(config: Config, make_agent: Callable[[Config, TensorSpec], Agent], simul
     hallucinator = make_hallucinator(config, simulator)
     torch.manual_seed(config.seed)  # After the hallucinator: with one seed all methods start from the same agent.
 
-    # The environment, one more for evaluation, and the agent.
-    env, evaluation_env = simulator.make(config.environment, seed=config.seed), simulator.make(config.environment)
+    # The environment and the agent.
+    env = simulator.make(config.environment, seed=config.seed)
     agent = make_agent(config, env.action_spec)
 
     # Replay with hindsight: failed rows come out of the buffer as successes.
     hindsight = make_hindsight(config, hallucinator)
     buffer = make_buffer(config, hindsight)
-    collector = make_collector(config, env, agent.explorer)
+    collector = make_collector(config, simulator, env, agent.explorer)
 
     # Learning.
     flags = simulator.pose_flags(config.environment)
     columns = (*COLUMNS, *(f"train/{name}" for name in agent.figures.values()), *(f"eval/{flag}" for flag in flags))
     folder = RunFolder(config.out, columns=columns)
     folder.write_config(dataclasses.asdict(config))
-    starts = range(EVALUATION_SEED, EVALUATION_SEED + config.evaluation_starts)
-    policy = train(
-        agent,
-        collector,
-        buffer,
-        hindsight=hindsight,
-        schedule=Schedule(config.total_frames, config.warmup_frames, config.frames_per_update, config.evaluate_every),
-        policy_average=config.policy_average,
-        evaluate=partial(evaluate, evaluation_env, seeds=starts, flags=flags),
-        folder=folder,
-        save=partial(save_policy, folder, config, simulator),
-        logger=make_tensorboard(config),
-        label=config.hindsight,
-    )
+    with make_evaluator(config, simulator, flags) as evaluator:
+        policy = train(
+            agent,
+            collector,
+            buffer,
+            hindsight=hindsight,
+            schedule=Schedule(
+                config.total_frames, config.warmup_frames, config.frames_per_update, config.evaluate_every
+            ),
+            policy_average=config.policy_average,
+            evaluate=evaluator,
+            report=Report(folder, make_tensorboard(config)),
+            save=partial(save_policy, folder, config, simulator),
+            label=config.hindsight,
+        )
     collector.shutdown()
 
     # Pictures.
-    draw_pictures(folder, config, evaluation_env, policy)
+    draw_pictures(folder, config, simulator.make(config.environment), policy)
     if hallucinator is not None:
         painters = {"true goal": simulator.GoalRenderer(config.environment), config.hindsight: hallucinator}
         draw_hallucinations(folder.file("hallucinations.png"), config, buffer, painters)
@@ -269,16 +278,24 @@ def make_hindsight(config: HindsightConfig, hallucinator: Hallucinator | None) -
     )
 
 
-def make_collector(config: HindsightConfig, env: EnvBase, explorer: TensorDictModuleBase) -> Collector:
-    """Return what steps the environment: uniformly random actions first, then the exploring policy."""
-    return Collector(
-        env,
-        explorer,
-        frames_per_batch=config.frames_per_batch,
-        total_frames=config.total_frames,
-        init_random_frames=config.warmup_frames,
-        track_traj_ids=False,
-        auto_register_policy_transforms=False,
+def make_collector(
+    config: HindsightConfig, simulator: Simulator, env: EnvBase, explorer: TensorDictModuleBase
+) -> BaseCollector:
+    """Return what steps the environment: uniformly random actions first, then the exploring policy.
+
+    In the background it steps one like it, by the policy as it was when the batch before was taken, and closes `env`.
+    """
+    settings: dict[str, Any] = {
+        "frames_per_batch": config.frames_per_batch,
+        "total_frames": config.total_frames,
+        "init_random_frames": config.warmup_frames,
+    }
+    if not config.background_collection:
+        return Collector(env, explorer, track_traj_ids=False, auto_register_policy_transforms=False, **settings)
+    env.close()
+    make_env = partial(simulator.make, config.environment, seed=config.seed)
+    return AsyncCollector(
+        make_env, explorer, postproc=ExcludeTransform("collector"), update_at_each_batch=True, **settings
     )
 
 
@@ -299,6 +316,20 @@ def make_tensorboard(config: HindsightConfig) -> Logger | None:
     if find_spec("tensorboard") is None:
         raise ImportError("--tensorboard needs the extra: pip install 'halgan-rl[tensorboard]'")
     return TensorboardLogger(exp_name="tensorboard", log_dir=str(config.out))
+
+
+Evaluator = Callable[[TensorDictModuleBase], Future[Evaluation]]
+
+
+def make_evaluator(
+    config: HindsightConfig, simulator: Simulator, flags: Sequence[str]
+) -> AbstractContextManager[Evaluator]:
+    """Return what judges policies on the fixed starts: beside training, or at once."""
+    make_env = partial(simulator.make, config.environment)
+    starts = range(EVALUATION_SEED, EVALUATION_SEED + config.evaluation_starts)
+    if config.background_evaluation:
+        return EvaluationProcess(make_env, threads=config.threads, seeds=starts, flags=flags)
+    return nullcontext(partial(evaluate_at_once, make_env(), seeds=starts, flags=flags))
 
 
 def save_policy(folder: RunFolder, config: HindsightConfig, simulator: Simulator, network: nn.Module) -> None:

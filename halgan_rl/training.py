@@ -1,23 +1,22 @@
 """The loop that all agents share: collect, replay with hindsight, update, evaluate."""
 
-import time
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from torch import nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import Compose
 from torchrl.modules import EGreedyModule
 from torchrl.objectives import LossModule, TargetNetUpdater
-from torchrl.record.loggers import Logger
 from tqdm import tqdm
 
 from halgan_rl.evaluation import Evaluation
-from halgan_rl.run_folder import RunFolder
+from halgan_rl.metrics import Means, Report
 
 COLUMNS = (
     "frames",
@@ -95,13 +94,12 @@ def train(
     hindsight: Compose | None,
     schedule: Schedule,
     policy_average: float,
-    evaluate: Callable[[TensorDictModuleBase], Evaluation],
-    folder: RunFolder,
+    evaluate: Callable[[TensorDictModuleBase], Future[Evaluation]],
+    report: Report,
     save: Callable[[nn.Module], None],
-    logger: Logger | None = None,
     label: str = "",
 ) -> TensorDictModuleBase:
-    """Train an agent, with a progress bar; write metrics and weights at each evaluation.
+    """Train an agent, with a progress bar; report metrics and save weights at each evaluation.
 
     Args:
         agent: what learns, in place.
@@ -111,20 +109,18 @@ def train(
         schedule: when what happens.
         policy_average: decay of the moving average of the network's weights, which is evaluated and saved; 0 takes the
             last weights.
-        evaluate: judges a policy.
-        folder: gets a row of metrics at each evaluation.
+        evaluate: judges a policy as it is when handed over, at once or beside training.
+        report: gets a row of metrics for each evaluation; all are written when this returns.
         save: keeps the averaged network at each evaluation.
-        logger: gets the metrics as well.
         label: what the progress bar is headed with.
 
     Returns:
         The policy of the averaged network.
     """
-    started = time.perf_counter()
     average = AveragedModel(agent.network, multi_avg_fn=get_ema_multi_avg_fn(policy_average))
     policy = agent.make_policy(average.module)
     means = Means()
-    frames, updates, next_evaluation, success = 0, 0, schedule.evaluate_every, float("nan")
+    frames, updates, next_evaluation = 0, 0, schedule.evaluate_every
     progress = tqdm(total=schedule.total_frames, unit="frame", desc=label, dynamic_ncols=True)
     for rollout in collector:
         buffer.extend(rollout)
@@ -146,44 +142,13 @@ def train(
 
         if frames >= next_evaluation or frames >= schedule.total_frames:
             next_evaluation += schedule.evaluate_every
-            evaluation = evaluate(policy)
-            success = evaluation.success_rate
-            metrics = dict.fromkeys(folder.columns, float("nan"))  # what there is none of yet
-            metrics |= {"frames": frames, "seconds": time.perf_counter() - started}
-            metrics |= {"train/epsilon": float(agent.epsilon.eps)} | evaluation.metrics()
+            metrics = {"frames": frames, "train/epsilon": float(agent.epsilon.eps)}
             metrics |= {f"train/{name}": value for name, value in means.pop().items()}
-            folder.write_metrics(metrics)
+            report.add(metrics, evaluate(policy))
             save(average.module)
-            if logger is not None:
-                for name, value in metrics.items():
-                    logger.log_scalar(name, value, step=frames)
+        report.write()
         progress.update(rollout.numel())
-        progress.set_postfix(success=f"{success:.0%}", updates=updates, refresh=False)
+        progress.set_postfix(success=f"{report.success:.0%}", updates=updates, refresh=False)
+    report.write(wait=True)
     progress.close()
     return policy
-
-
-class Means:
-    """Means of figures between two evaluations, without a synchronisation an update.
-
-    Examples:
-        >>> means = Means()
-        >>> means.add(loss=torch.tensor([1.0, 3.0]))
-        >>> means.add(loss=torch.tensor(4.0))
-        >>> means.pop(), means.pop()
-        ({'loss': 3.0}, {})
-    """
-
-    def __init__(self) -> None:
-        self._values: dict[str, list[Tensor]] = {}
-
-    def add(self, **values: Tensor) -> None:
-        """Add a value, or the mean of several, to each named mean."""
-        for name, value in values.items():
-            self._values.setdefault(name, []).append(value.detach().float().mean())
-
-    def pop(self) -> dict[str, float]:
-        """Return all means and start afresh."""
-        means = {name: float(torch.stack(values).mean()) for name, values in self._values.items()}
-        self._values = {}
-        return means

@@ -24,6 +24,7 @@ TINY = dataclasses.replace(
     evaluation_starts=1,
     film_starts=1,
     bank=False,
+    background_evaluation=False,
 )
 
 
@@ -87,6 +88,22 @@ def test_a_run_repeats_itself_bit_for_bit(halgan_run: Path, tmp_path: Path) -> N
     first, second = (read_metrics(path / "metrics.csv") for path in (halgan_run, tmp_path / "again"))
     assert first.pop("seconds") != second.pop("seconds")
     assert repr(first) == repr(second)  # NaN, where no episode ended, is equal to itself as text only
+
+
+def test_evaluation_in_the_background_changes_nothing(halgan_run: Path, tmp_path: Path) -> None:
+    beside = run(tmp_path / "beside", background_evaluation=True)
+    assert differ(load_file(halgan_run / "policy.safetensors"), beside) == set()
+    at_once, later = (read_metrics(path / "metrics.csv") for path in (halgan_run, tmp_path / "beside"))
+    assert at_once.pop("seconds") != later.pop("seconds")
+    assert repr(at_once) == repr(later)
+
+
+def test_an_agent_learns_from_what_is_collected_in_the_background(halgan_run: Path, tmp_path: Path) -> None:
+    trained = run(tmp_path / "beside", background_collection=True)
+    assert differ(load_file(halgan_run / "policy.safetensors"), trained) == set(trained)
+    metrics = read_metrics(tmp_path / "beside" / "metrics.csv")
+    assert metrics["frames"] == [80, 160]
+    assert 0.05 < metrics["train/hallucinated_fraction"][-1] < 0.5
 
 
 def test_seed_and_method_change_what_is_learned(halgan_run: Path, tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ TINY = {
     "evaluation_starts": 1,
     "film_starts": 1,
     "bank": False,
+    "background_evaluation": False,
 }
 RECIPES: dict[str, tuple[HindsightConfig, Callable[[Any], None]]] = {
     "pick & place": (ddpg_pick_place.Config(), ddpg_pick_place.main),
