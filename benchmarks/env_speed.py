@@ -1,19 +1,23 @@
-"""Steps and frames a second of the environments, beside dm_control's stock camera in the same scene.
+"""Steps and frames a second of the environments, beside dm_control's stock camera in the same scene, and MiniWorld.
 
 Usage: python -m benchmarks.env_speed [--names navigate-2m pebble] [--steps 500] [--rounds 5]
 
 Every measurement runs in a process of its own (OpenGL contexts of different kinds do not mix), the variants by turns,
 so that what else the machine does falls on all of them. The table shows medians, by wall time and by processor time,
-which a busy machine distorts less; the ratios are of processor time.
+which a busy machine distorts less; the ratios are of processor time. MiniWorld's OneRoom, another simulator's room with
+a red box, stands beside navigate-2m, and so does our Gymnasium face, which is its interface.
 """
 
 import argparse
+import importlib
 import statistics
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 
+import gymnasium
 import numpy as np
 import torch
 
@@ -54,6 +58,21 @@ def stock_camera(name: str, steps: int) -> Callable[[], None]:
     return stepping(Environment(task, time_limit=20.0, random_state=0), steps)
 
 
+def gymnasium_face(name: str, steps: int) -> Callable[[], None]:
+    """The Gymnasium environment, with random actions."""
+    return stepping_gymnasium(gymnasium.make(envs.gymnasium_id(name)), steps)
+
+
+def miniworld(name: str, steps: int) -> Callable[[], None]:
+    """MiniWorld's OneRoom, without a window, whatever the name."""
+    del name
+    import pyglet
+
+    pyglet.options["headless"] = True
+    gymnasium.register_envs(importlib.import_module("miniworld"))
+    return stepping_gymnasium(gymnasium.make("MiniWorld-OneRoom-v0", obs_width=64, obs_height=64), steps)
+
+
 TASKS = ("navigate-2m", "pick-and-place-2m", "pebble")
 """One environment of each task."""
 VARIANTS = {
@@ -62,6 +81,8 @@ VARIANTS = {
     "ours, TorchRL": torchrl_face,
     "stock composer camera": stock_camera,
 }
+ALL_VARIANTS = VARIANTS | {"ours, Gymnasium": gymnasium_face, "MiniWorld OneRoom, Gymnasium": miniworld}
+"""Beside navigate-2m, the room that is most like MiniWorld's."""
 
 
 def stepping(environment: Environment, steps: int) -> Callable[[], None]:
@@ -69,6 +90,19 @@ def stepping(environment: Environment, steps: int) -> Callable[[], None]:
     random_state = np.random.RandomState(0)
     actions = [random_action(environment.action_spec(), random_state) for _ in range(steps)]
     return lambda: [environment.step(action) for action in actions][:0]
+
+
+def stepping_gymnasium(env: gymnasium.Env, steps: int) -> Callable[[], None]:
+    """A run of random steps, resets included."""
+    env.action_space.seed(0)
+    env.reset(seed=0)
+
+    def step() -> None:
+        *_, terminated, truncated, _ = env.step(env.action_space.sample())
+        if terminated or truncated:
+            env.reset()
+
+    return partial(repeat, steps, step)
 
 
 def repeat(times: int, what: Callable[[], object]) -> None:
@@ -80,7 +114,7 @@ def repeat(times: int, what: Callable[[], object]) -> None:
 def measure(variant: str, name: str, steps: int) -> tuple[float, float]:
     """Steps a second of one variant, of wall time and of processor time, after a warm-up of the same length."""
     torch.set_num_threads(1)
-    run = VARIANTS[variant](name, steps)
+    run = ALL_VARIANTS[variant](name, steps)
     run()
     wall, processor = time.perf_counter(), time.process_time()
     run()
@@ -102,14 +136,15 @@ def main() -> None:
     parser.add_argument("--names", nargs="+", default=TASKS, choices=sorted(envs.NAMES), help="which environments")
     parser.add_argument("--steps", default=500, type=int, help="steps a measurement")
     parser.add_argument("--rounds", default=5, type=int, help="measurements a variant")
-    parser.add_argument("--variant", choices=list(VARIANTS), help="measure only this one, in the first of them, here")
+    parser.add_argument("--variant", choices=ALL_VARIANTS, help="measure only this one, in the first of them, here")
     flags = parser.parse_args()
     if flags.variant:
         print(*measure(flags.variant, flags.names[0], flags.steps))
         return
     tables = []
     for name in flags.names:
-        results: dict[str, list[tuple[float, float]]] = {variant: [] for variant in VARIANTS}
+        compared = ALL_VARIANTS if name == "navigate-2m" else VARIANTS
+        results: dict[str, list[tuple[float, float]]] = {variant: [] for variant in compared}
         for _ in range(flags.rounds):
             for variant, values in results.items():
                 values.append(measure_elsewhere(variant, name, flags.steps))

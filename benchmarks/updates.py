@@ -15,11 +15,14 @@ rounds.
 Stable-Baselines3's DQN is not double: it does not ask the online network about next frames, one forward pass less. So
 ours is measured without that pass as well ("ours, not double"). Its ``train`` leaves the target network to the steps in
 the environment; here the target network follows at each update, as in the others.
+
+"Our convolutions alone" are what no update with these networks can do without: those of our update, forward and, where
+they learn, backward, on images that are ready. All else (sampling, heads, losses, Adam, targets) is left out.
 """
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -39,6 +42,7 @@ from benchmarks.tables import Table, report
 from halgan_rl import ddpg, ddqn
 from halgan_rl.experiment import HindsightConfig, make_buffer
 from halgan_rl.models.agents import Actor, Critic, Downsample, QNetwork, Vision, greedy_policy
+from halgan_rl.models.pixels import to_float
 from halgan_rl.training import Agent
 from recipes import ddpg_navigate, ddqn_pebble
 
@@ -73,6 +77,21 @@ def ours(
     buffer.extend(plain(rows))
     agent = make_agent(config, actions)
     return lambda: agent.update(buffer.sample()), count_parameters(agent.loss)
+
+
+def convolutions(config: HindsightConfig, rows: TensorDict, learning: Sequence[bool]) -> Update:
+    """Return the convolutions of an update: one pass for each entry, and back where it is True."""
+    images = to_float(rows["pixels"][: config.batch_size])
+    networks = [Vision(config.downsample) for _ in learning]
+
+    def run() -> None:
+        for network, learns in zip(networks, learning, strict=True):
+            with torch.set_grad_enabled(learns):
+                features = network.layers(images)
+            if learns:
+                features.backward(torch.ones_like(features))
+
+    return run
 
 
 def make_single_dqn(config: ddqn.DDQNConfig, actions: TensorSpec) -> Agent:
@@ -177,11 +196,13 @@ class Algorithm:
         config: the recipe's.
         actions: of its environment.
         variants: ours and its peers.
+        passes: through convolutions in our update: whether they learn.
     """
 
     config: HindsightConfig
     actions: TensorSpec
     variants: Mapping[str, Variant]
+    passes: Sequence[bool]
 
 
 DRIVE, CHOICE = Bounded(-1.0, 1.0, (2,)), OneHot(4, dtype=torch.int64)
@@ -194,6 +215,8 @@ ALGORITHMS = {
             "SB3 DDPG.train": sb3_ddpg,
             "torchrl plain loop": partial(torchrl_loop, torchrl_ddpg),
         },
+        # The critic's and the actor's at s, the critic's for the actor, and the two targets' at s'.
+        passes=(True, True, False, False, False),
     ),
     "DDQN": Algorithm(
         ddqn_pebble.Config(hindsight="none"),
@@ -204,12 +227,14 @@ ALGORITHMS = {
             "SB3 DQN.train, not double": sb3_dqn,
             "torchrl plain loop": partial(torchrl_loop, torchrl_ddqn),
         },
+        # The network's at s and at s', and the target's at s'.
+        passes=(True, False, False),
     ),
 }
 
 
 def make_updates(algorithm: Algorithm, rows: TensorDict, **changes: Any) -> dict[str, Update]:
-    """Return an update of each variant; their networks have the same numbers of parameters.
+    """Return an update of each variant, and what bounds ours; their networks have the same numbers of parameters.
 
     Args:
         algorithm: what to measure.
@@ -225,7 +250,8 @@ def make_updates(algorithm: Algorithm, rows: TensorDict, **changes: Any) -> dict
     counts = {name: parameters for name, (_, parameters) in made.items()}
     if len(set(counts.values())) != 1:
         raise RuntimeError(f"the networks differ, this would compare apples with pears: {counts}")
-    return {name: run for name, (run, _) in made.items()}
+    bound = convolutions(config, rows, algorithm.passes)
+    return {name: run for name, (run, _) in made.items()} | {"our convolutions alone": bound}
 
 
 Case = tuple[str, str, int, str]

@@ -19,8 +19,8 @@ class EvaluationProcess:
     """Evaluates policies in a process of its own, so that training need not wait.
 
     A policy is copied when it is handed over, and its starts are fixed, so its figures are those of
-    :func:`~halgan_rl.evaluation.evaluate`, whenever they come. Policies are taken one by one, in order. It is a context,
-    with which the process ends; what it has not begun then is dropped.
+    :func:`~halgan_rl.evaluation.evaluate`, whenever they come. Policies are taken one by one, in order. It is a
+    context, with which the process ends; what it has not begun then is dropped.
 
     Args:
         make_env: makes the environment, in the other process: a function at the top of a module, or a
