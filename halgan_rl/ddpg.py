@@ -12,7 +12,7 @@ from halgan_rl import experiment
 from halgan_rl.experiment import HindsightConfig
 from halgan_rl.models.agents import Actor, Critic, deterministic_policy
 from halgan_rl.objectives import ClippedTD0Estimator, UnsaturatedDDPGLoss
-from halgan_rl.training import Agent
+from halgan_rl.training import Agent, on_cpu
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,20 +54,22 @@ def make_agent(config: DDPGConfig, action_spec: TensorSpec) -> Agent:
             f"{config.environment} has discrete actions, DDPG needs continuous ones: train it with DDQN "
             "(halgan_rl.ddqn; recipes/ddqn_pebble.py)"
         )
-    network = Actor(action_spec.shape[-1], downsample=config.downsample, small_output=config.small_output)
-    actor = deterministic_policy(network)
+    size, downsample = action_spec.shape[-1], config.downsample
+    network = Actor(size, downsample=downsample, small_output=config.small_output).to(config.device)
+    acting = on_cpu(network)
     critic = TensorDictModule(
-        Critic(action_spec.shape[-1], downsample=config.downsample),
+        Critic(size, downsample=downsample).to(config.device),
         in_keys=["pixels", "action"],
         out_keys=["state_action_value"],
     )
     noise = AdditiveGaussianModule(action_spec, sigma_init=config.noise, sigma_end=config.noise)
     epsilon = EGreedyModule(action_spec, config.epsilon_start, config.epsilon_end, config.epsilon_frames)
-    loss = make_loss(config, actor, critic)
+    loss = make_loss(config, deterministic_policy(network), critic)
     return Agent(
         network=network,
+        acting=acting,
         make_policy=deterministic_policy,
-        explorer=TensorDictSequential(actor, noise, epsilon),
+        explorer=TensorDictSequential(deterministic_policy(acting), noise, epsilon),
         epsilon=epsilon,
         loss=loss,
         optimizer=make_optimizer(config, loss),

@@ -11,7 +11,7 @@ from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
 from halgan_rl.experiment import HindsightConfig
 from halgan_rl.models.agents import QNetwork, greedy_policy
 from halgan_rl.objectives import ClippedTD0Estimator
-from halgan_rl.training import Agent
+from halgan_rl.training import Agent, on_cpu
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,14 +33,15 @@ def make_agent(config: DDQNConfig, action_spec: TensorSpec) -> Agent:
             f"{config.environment} has continuous actions, DDQN needs one-hot ones: train it with DDPG "
             "(halgan_rl.ddpg; recipes/ddpg_navigate.py)"
         )
-    network = QNetwork(action_spec.shape[-1], downsample=config.downsample)
-    actor = greedy_policy(network)
+    network = QNetwork(action_spec.shape[-1], downsample=config.downsample).to(config.device)
+    acting = on_cpu(network)
     epsilon = EGreedyModule(action_spec, config.epsilon_start, config.epsilon_end, config.epsilon_frames)
-    loss = make_loss(config, actor)
+    loss = make_loss(config, greedy_policy(network))
     return Agent(
         network=network,
+        acting=acting,
         make_policy=greedy_policy,
-        explorer=TensorDictSequential(actor, epsilon),
+        explorer=TensorDictSequential(greedy_policy(acting), epsilon),
         epsilon=epsilon,
         loss=loss,
         optimizer=torch.optim.Adam(loss.value_network_params.values(True, True), config.learning_rate, fused=True),

@@ -41,7 +41,7 @@ class EvaluationProcess:
 
     def __call__(self, policy: TensorDictModuleBase) -> Future[Evaluation]:
         """Hand over a policy as it is now; its figures come later."""
-        return self._executor.submit(_evaluate, copy.deepcopy(policy), self._settings)
+        return self._executor.submit(_evaluate, copy.deepcopy(policy).cpu(), self._settings)
 
     def __enter__(self) -> "EvaluationProcess":
         return self
@@ -59,9 +59,9 @@ class EvaluationProcess:
 
 
 def evaluate_at_once(env: EnvBase, policy: TensorDictModuleBase, **settings: Any) -> Future[Evaluation]:
-    """Evaluate here and now; arguments as for :func:`~halgan_rl.evaluation.evaluate`. The figures are there already."""
+    """Evaluate a copy here and now; arguments as for :func:`~halgan_rl.evaluation.evaluate`."""
     done: Future[Evaluation] = Future()
-    done.set_result(evaluate(env, policy, **settings))
+    done.set_result(evaluate(env, copy.deepcopy(policy).cpu(), **settings))
     return done
 
 

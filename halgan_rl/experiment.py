@@ -85,6 +85,10 @@ class HindsightConfig:
     """Folder of the run; must not hold one yet."""
     threads: int = 1
     """Threads of PyTorch; more do not help networks this small, and change the last bits of every sum."""
+    device: str = "cpu"
+    """Where the agent learns, such as `cuda`. Environments, replay and hindsight stay on the CPU."""
+    compile: Literal["no", "default", "reduce-overhead", "max-autotune"] = "no"
+    """How `torch.compile` treats the loss; with `reduce-overhead` it makes CUDA graphs. On a CPU it does not pay."""
     background_evaluation: bool = True
     """Evaluate in a process of its own, while training goes on; what is learned and measured is the same."""
     background_collection: bool = False
@@ -188,9 +192,10 @@ def run(config: Config, make_agent: Callable[[Config, TensorSpec], Agent], simul
 
     Raises:
         FileExistsError: if `config.out` already holds anything.
-        ValueError: if the environment is unknown, or the weights do not fit it.
+        ValueError: if the environment is unknown, the weights do not fit it, or the device cannot be used.
     """
     check_unused(config.out)
+    check_device(config.device)
     torch.set_num_threads(config.threads)
     hallucinator = make_hallucinator(config, simulator)
     torch.manual_seed(config.seed)  # After the hallucinator: with one seed all methods start from the same agent.
@@ -198,6 +203,8 @@ def run(config: Config, make_agent: Callable[[Config, TensorSpec], Agent], simul
     # The environment and the agent.
     env = simulator.make(config.environment, seed=config.seed)
     agent = make_agent(config, env.action_spec)
+    if config.compile != "no":
+        agent.loss.compile(mode=config.compile)
 
     # Replay with hindsight: failed rows come out of the buffer as successes.
     hindsight = make_hindsight(config, hallucinator)
@@ -232,6 +239,15 @@ def run(config: Config, make_agent: Callable[[Config, TensorSpec], Agent], simul
         painters = {"true goal": simulator.GoalRenderer(config.environment), config.hindsight: hallucinator}
         draw_hallucinations(folder.file("hallucinations.png"), config, buffer, painters)
     return read_metrics(folder.file("metrics.csv"))["eval/success_rate"][-1]
+
+
+def check_device(device: str) -> None:
+    """Refuse a device that PyTorch cannot use here."""
+    try:
+        torch.empty(0, device=device)
+    except (AssertionError, NotImplementedError, RuntimeError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"device={device!r} cannot be used here ({reason}): choose 'cpu'") from error
 
 
 def make_hallucinator(config: HindsightConfig, simulator: Simulator) -> Hallucinator | None:

@@ -1,8 +1,10 @@
 """The loop that all agents share: collect, replay with hindsight, update, evaluate."""
 
+import copy
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from tensordict import TensorDictBase
@@ -36,9 +38,10 @@ class Agent:
     """An agent that learns.
 
     Attributes:
-        network: chooses the actions; what is averaged, evaluated and saved.
+        network: chooses the actions; what is averaged, evaluated and saved. It learns on whatever device it is on.
+        acting: the same network where the environment is, on the CPU: see :func:`on_cpu`.
         make_policy: wraps the network, or an average of it, as a deterministic policy.
-        explorer: the network with its exploration; what collects.
+        explorer: the acting network with its exploration; what collects.
         epsilon: the part of the explorer that acts at random, less and less.
         loss: TorchRL's loss.
         optimizer: of all parameters of the loss.
@@ -47,6 +50,7 @@ class Agent:
     """
 
     network: nn.Module
+    acting: nn.Module
     make_policy: Callable[..., TensorDictModuleBase]
     explorer: TensorDictModuleBase
     epsilon: EGreedyModule
@@ -56,13 +60,29 @@ class Agent:
     figures: Mapping[str, str]
 
     def update(self, batch: TensorDictBase) -> TensorDictBase:
-        """Make one update; return the loss module's output."""
+        """Make one update; return the loss module's output, which stays on the network's device."""
+        if self.acting is not self.network:
+            device = next(self.network.parameters()).device
+            batch = batch.select(*self.loss.in_keys, strict=False).to(device, non_blocking=True)
         losses = self.loss(batch)
         sum(value for name, value in losses.items() if name.startswith("loss")).backward()
         self.optimizer.step()
         self.optimizer.zero_grad()
         self.target_updater.step()
         return losses
+
+    def act_on_latest(self) -> None:
+        """Let the acting network have what the other has learned."""
+        if self.acting is not self.network:
+            self.acting.load_state_dict(self.network.state_dict())
+
+
+Network = TypeVar("Network", bound=nn.Module)
+
+
+def on_cpu(network: Network) -> Network:
+    """Return a network itself if it is on the CPU, or else a copy there: for one frame the way to a GPU is too long."""
+    return network if next(network.parameters()).device.type == "cpu" else copy.deepcopy(network).cpu()
 
 
 @dataclass(frozen=True)
@@ -115,7 +135,7 @@ def train(
         label: what the progress bar is headed with.
 
     Returns:
-        The policy of the averaged network.
+        The policy of the averaged network, on the CPU.
     """
     average = AveragedModel(agent.network, multi_avg_fn=get_ema_multi_avg_fn(policy_average))
     policy = agent.make_policy(average.module)
@@ -139,6 +159,7 @@ def train(
             relabelled = batch["goal", "mask"].float().mean() if hindsight is not None else torch.zeros(())
             figures = {shown: losses[name] for name, shown in agent.figures.items()}
             means.add(hallucinated_fraction=relabelled, **figures)
+        agent.act_on_latest()
 
         if frames >= next_evaluation or frames >= schedule.total_frames:
             next_evaluation += schedule.evaluate_every
@@ -151,4 +172,4 @@ def train(
         progress.set_postfix(success=f"{report.success:.0%}", updates=updates, refresh=False)
     report.write(wait=True)
     progress.close()
-    return policy
+    return policy.cpu()
