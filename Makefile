@@ -28,7 +28,7 @@ format: $(VENV)/ready
 	$(BIN)/ruff format .
 
 bench: $(BENCH_VENV)/ready  ## speed and memory side by side with the peers, in an environment of their own
-	for benchmark in env_speed replay updates update_cost frame_time; do \
+	for benchmark in env_speed replay updates update_cost frame_time overlap; do \
 	  $(BENCH_VENV)/bin/python -m benchmarks.$$benchmark || exit 1; done
 
 weights: $(VENV)/ready  ## train the shipped generators again (a few minutes)
