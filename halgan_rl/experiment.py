@@ -197,8 +197,7 @@ def run(config: Config, make_agent: Callable[[Config, TensorSpec], Agent], simul
     check_unused(config.out)
     check_device(config.device)
     torch.set_num_threads(config.threads)
-    hallucinator = make_hallucinator(config, simulator)
-    torch.manual_seed(config.seed)  # After the hallucinator: with one seed all methods start from the same agent.
+    torch.manual_seed(config.seed)
 
     # The environment and the agent.
     env = simulator.make(config.environment, seed=config.seed)
@@ -207,6 +206,8 @@ def run(config: Config, make_agent: Callable[[Config, TensorSpec], Agent], simul
         agent.loss.compile(mode=config.compile)
 
     # Replay with hindsight: failed rows come out of the buffer as successes.
+    with torch.random.fork_rng(devices=[]):  # With one seed all methods explore alike, whatever a painter draws.
+        hallucinator = make_hallucinator(config, simulator)
     hindsight = make_hindsight(config, hallucinator)
     buffer = make_buffer(config, hindsight)
     collector = make_collector(config, simulator, env, agent.explorer)
