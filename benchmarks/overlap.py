@@ -7,7 +7,7 @@ Usage::
 Runs each recipe in its default configuration, but short, in all three ways by turns, and takes the time from its first
 evaluation to its last. That is early in a training, when the episodes that are evaluated are longest. With
 ``background_evaluation`` nothing that is learned or measured changes; with ``background_collection`` the exploring
-policy is a batch older, and runs are not repeatable.
+policy is a batch older.
 """
 
 import dataclasses
@@ -38,7 +38,7 @@ class Benchmark:
 
     rounds: int = 3
     """Trainings of each kind; the median is reported."""
-    frames: int = 4_000
+    frames: int = 6_000
     """Frames of a training, of which the first evaluation's are not timed."""
 
 

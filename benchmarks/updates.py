@@ -16,8 +16,9 @@ Stable-Baselines3's DQN is not double: it does not ask the online network about 
 ours is measured without that pass as well ("ours, not double"). Its ``train`` leaves the target network to the steps in
 the environment; here the target network follows at each update, as in the others.
 
-"Our convolutions alone" are what no update with these networks can do without: those of our update, forward and, where
-they learn, backward, on images that are ready. All else (sampling, heads, losses, Adam, targets) is left out.
+"Convolutions alone" are the passes that no update of these networks can spare, forward and, where they learn, backward,
+on images that are ready: what an update would take if all else (sampling, heads, losses, Adam, targets) cost nothing.
+Ours makes one pass more in DDPG: TorchRL's loss asks the critic for the features of a frame twice.
 """
 
 import dataclasses
@@ -196,7 +197,7 @@ class Algorithm:
         config: the recipe's.
         actions: of its environment.
         variants: ours and its peers.
-        passes: through convolutions in our update: whether they learn.
+        passes: through convolutions that an update needs: whether they learn.
     """
 
     config: HindsightConfig
@@ -215,8 +216,7 @@ ALGORITHMS = {
             "SB3 DDPG.train": sb3_ddpg,
             "torchrl plain loop": partial(torchrl_loop, torchrl_ddpg),
         },
-        # The critic's and the actor's at s, the critic's for the actor, and the two targets' at s'.
-        passes=(True, True, False, False, False),
+        passes=(True, True, False, False),  # actor and critic at s, their targets at s'
     ),
     "DDQN": Algorithm(
         ddqn_pebble.Config(hindsight="none"),
@@ -227,14 +227,13 @@ ALGORITHMS = {
             "SB3 DQN.train, not double": sb3_dqn,
             "torchrl plain loop": partial(torchrl_loop, torchrl_ddqn),
         },
-        # The network's at s and at s', and the target's at s'.
-        passes=(True, False, False),
+        passes=(True, False, False),  # the network at s and at s', its target at s'
     ),
 }
 
 
 def make_updates(algorithm: Algorithm, rows: TensorDict, **changes: Any) -> dict[str, Update]:
-    """Return an update of each variant, and what bounds ours; their networks have the same numbers of parameters.
+    """Return an update of each variant, and their convolutions alone; the networks have the same numbers of parameters.
 
     Args:
         algorithm: what to measure.
@@ -251,7 +250,7 @@ def make_updates(algorithm: Algorithm, rows: TensorDict, **changes: Any) -> dict
     if len(set(counts.values())) != 1:
         raise RuntimeError(f"the networks differ, this would compare apples with pears: {counts}")
     bound = convolutions(config, rows, algorithm.passes)
-    return {name: run for name, (run, _) in made.items()} | {"our convolutions alone": bound}
+    return {name: run for name, (run, _) in made.items()} | {"convolutions alone": bound}
 
 
 Case = tuple[str, str, int, str]

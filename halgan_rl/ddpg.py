@@ -84,7 +84,9 @@ def make_loss(config: DDPGConfig, actor: TensorDictModule, critic: TensorDictMod
         actor, critic, delay_actor=True, delay_value=True, preactivation_weight=config.preactivation_weight
     )
     if config.clip_targets:
-        estimator = ClippedTD0Estimator(low=-1.0, high=1.0, gamma=config.discount, value_network=loss.actor_critic)
+        estimator = ClippedTD0Estimator(
+            low=-1.0, high=1.0, gamma=config.discount, value_network=loss.actor_critic, device=config.device
+        )
         estimator.set_keys(value=loss.tensor_keys.state_action_value)
         loss.make_value_estimator(estimator)
     else:

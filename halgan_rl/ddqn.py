@@ -54,7 +54,9 @@ def make_loss(config: DDQNConfig, actor: TensorDictSequential) -> DQNLoss:
     """Return TorchRL's double-DQN loss with the targets that the configuration asks for."""
     loss = DQNLoss(actor, delay_value=True, double_dqn=True, action_space="one_hot")
     if config.clip_targets:
-        estimator = ClippedTD0Estimator(low=-1.0, high=1.0, gamma=config.discount, value_network=loss.value_network)
+        estimator = ClippedTD0Estimator(
+            low=-1.0, high=1.0, gamma=config.discount, value_network=loss.value_network, device=config.device
+        )
         loss.make_value_estimator(estimator)
     else:
         loss.make_value_estimator(ValueEstimators.TD0, gamma=config.discount)

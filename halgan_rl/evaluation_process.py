@@ -2,9 +2,13 @@
 
 import copy
 import multiprocessing
+import os
+import signal
+import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import wait
 from types import TracebackType
 from typing import Any
 
@@ -19,17 +23,19 @@ class EvaluationProcess:
     """Evaluates policies in a process of its own, so that training need not wait.
 
     A policy is copied when it is handed over, and its starts are fixed, so its figures are those of
-    :func:`~halgan_rl.evaluation.evaluate`, whenever they come. Policies are taken one by one, in order. It is a
-    context, with which the process ends; what it has not begun then is dropped.
+    :func:`~halgan_rl.evaluation.evaluate`, whenever they come. Policies are taken one by one, in order.
+
+    The process starts at once, which takes some seconds; entering the context waits for it. At the end of the context
+    it finishes what it is at, or, if there was an error, is stopped.
 
     Args:
-        make_env: makes the environment, in the other process: a function at the top of a module, or a
+        make_env: makes the environment, in the other process; it must pickle: a function at the top of a module, or a
             ``functools.partial`` of one.
         threads: of PyTorch there.
         settings: further arguments of :func:`~halgan_rl.evaluation.evaluate`.
 
     Raises:
-        RuntimeError: at the end of the context, if the process could not be started or has died.
+        RuntimeError: on entering the context, if the process could not be started; on leaving it, if it has died.
     """
 
     def __init__(self, make_env: Callable[[], EnvBase], *, threads: int = 1, **settings: Any) -> None:
@@ -37,25 +43,36 @@ class EvaluationProcess:
         self._executor = ProcessPoolExecutor(
             1, mp_context=multiprocessing.get_context("spawn"), initializer=_open, initargs=(make_env, threads)
         )
-        self._executor.submit(_is_open)  # Starting takes seconds: let them pass during the warm-up.
+        self._started = self._executor.submit(os.getpid)
 
     def __call__(self, policy: TensorDictModuleBase) -> Future[Evaluation]:
         """Hand over a policy as it is now; its figures come later."""
         return self._executor.submit(_evaluate, copy.deepcopy(policy).cpu(), self._settings)
 
     def __enter__(self) -> "EvaluationProcess":
+        try:
+            self._started.result()
+        except BrokenProcessPool as error:
+            self._executor.shutdown()
+            raise _died() from error
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if error is not None and not isinstance(error, BrokenProcessPool):
+            os.kill(self._started.result(), signal.SIGTERM)
         self._executor.shutdown(cancel_futures=True)
         if isinstance(error, BrokenProcessPool):
-            raise RuntimeError(
-                "the process that evaluates could not be started, or has died, for the reason printed above: start "
-                "trainings from a file or a module, below `if __name__ == '__main__':`, or evaluate in this process "
-                "(--no-background-evaluation)"
-            ) from error
+            raise _died() from error
+
+
+def _died() -> RuntimeError:
+    return RuntimeError(
+        "the process that evaluates could not be started, or has died, for the reason printed above: start trainings "
+        "from a file or a module, below `if __name__ == '__main__':`, or evaluate in this process "
+        "(--no-background-evaluation)"
+    )
 
 
 def evaluate_at_once(env: EnvBase, policy: TensorDictModuleBase, **settings: Any) -> Future[Evaluation]:
@@ -70,12 +87,17 @@ _env: EnvBase
 
 def _open(make_env: Callable[[], EnvBase], threads: int) -> None:
     global _env
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(threads)
     _env = make_env()
 
 
-def _is_open() -> None:
-    """Done as soon as the process can evaluate."""
+def _end_with_parent() -> None:
+    """End this process when the one that trains is gone, however it went."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)
 
 
 def _evaluate(policy: TensorDictModuleBase, settings: dict[str, Any]) -> Evaluation:

@@ -6,7 +6,7 @@ Knows no simulator: the recipes pass one, see :class:`Simulator`.
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,13 +15,14 @@ from typing import Any, Literal, Protocol, TypeVar
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
-from torchrl.collectors import AsyncCollector, BaseCollector, Collector
+from torchrl.collectors import BaseCollector, Collector
 from torchrl.data import TensorDictReplayBuffer, TensorSpec
 from torchrl.envs import Compose, EnvBase, ExcludeTransform
 from torchrl.record.loggers import Logger
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
 from halgan_rl import pictures, pipelines
+from halgan_rl.background_collector import BackgroundCollector
 from halgan_rl.evaluation import Evaluation, record
 from halgan_rl.evaluation_process import EvaluationProcess, evaluate_at_once
 from halgan_rl.frame_storage import FrameStorage
@@ -92,7 +93,7 @@ class HindsightConfig:
     background_evaluation: bool = True
     """Evaluate in a process of its own, while training goes on; what is learned and measured is the same."""
     background_collection: bool = False
-    """Collect in a process of its own, while the agent is updated: faster, but runs with one seed then differ."""
+    """Collect in a process of its own while the agent is updated, by a policy that is a batch older."""
     tensorboard: bool = False
     """Also write TensorBoard logs (needs the `tensorboard` extra)."""
 
@@ -204,20 +205,21 @@ def run(config: Config, make_agent: Callable[[Config, TensorSpec], Agent], simul
     agent = make_agent(config, env.action_spec)
     if config.compile != "no":
         agent.loss.compile(mode=config.compile)
+    flags = simulator.pose_flags(config.environment)
+    evaluator = make_evaluator(config, simulator, flags)
 
     # Replay with hindsight: failed rows come out of the buffer as successes.
     with torch.random.fork_rng(devices=[]):  # With one seed all methods explore alike, whatever a painter draws.
         hallucinator = make_hallucinator(config, simulator)
     hindsight = make_hindsight(config, hallucinator)
     buffer = make_buffer(config, hindsight)
-    collector = make_collector(config, simulator, env, agent.explorer)
 
     # Learning.
-    flags = simulator.pose_flags(config.environment)
-    columns = (*COLUMNS, *(f"train/{name}" for name in agent.figures.values()), *(f"eval/{flag}" for flag in flags))
-    folder = RunFolder(config.out, columns=columns)
-    folder.write_config(dataclasses.asdict(config))
-    with make_evaluator(config, simulator, flags) as evaluator:
+    with ExitStack() as stack:
+        evaluate = stack.enter_context(evaluator)
+        folder = make_folder(config, agent, flags)
+        collector = make_collector(config, simulator, env, agent.explorer)
+        stack.callback(collector.shutdown)
         policy = train(
             agent,
             collector,
@@ -227,12 +229,11 @@ def run(config: Config, make_agent: Callable[[Config, TensorSpec], Agent], simul
                 config.total_frames, config.warmup_frames, config.frames_per_update, config.evaluate_every
             ),
             policy_average=config.policy_average,
-            evaluate=evaluator,
+            evaluate=evaluate,
             report=Report(folder, make_tensorboard(config)),
             save=partial(save_policy, folder, config, simulator),
             label=config.hindsight,
         )
-    collector.shutdown()
 
     # Pictures.
     draw_pictures(folder, config, simulator.make(config.environment), policy)
@@ -245,8 +246,8 @@ def run(config: Config, make_agent: Callable[[Config, TensorSpec], Agent], simul
 def check_device(device: str) -> None:
     """Refuse a device that PyTorch cannot use here."""
     try:
-        torch.empty(0, device=device)
-    except (AssertionError, NotImplementedError, RuntimeError) as error:
+        torch.zeros(1, device=device).cpu()
+    except (AssertionError, ImportError, NotImplementedError, RuntimeError) as error:
         reason = str(error).splitlines()[0]
         raise ValueError(f"device={device!r} cannot be used here ({reason}): choose 'cpu'") from error
 
@@ -300,7 +301,7 @@ def make_collector(
 ) -> BaseCollector:
     """Return what steps the environment: uniformly random actions first, then the exploring policy.
 
-    In the background it steps one like it, by the policy as it was when the batch before was taken, and closes `env`.
+    In the background it steps one like it, and closes `env`.
     """
     settings: dict[str, Any] = {
         "frames_per_batch": config.frames_per_batch,
@@ -310,10 +311,23 @@ def make_collector(
     if not config.background_collection:
         return Collector(env, explorer, track_traj_ids=False, auto_register_policy_transforms=False, **settings)
     env.close()
-    make_env = partial(simulator.make, config.environment, seed=config.seed)
-    return AsyncCollector(
-        make_env, explorer, postproc=ExcludeTransform("collector"), update_at_each_batch=True, **settings
+    collector = BackgroundCollector(
+        partial(simulator.make, config.environment),
+        explorer,
+        postproc=ExcludeTransform("collector"),
+        num_threads=config.threads,
+        **settings,
     )
+    collector.set_seed(config.seed)
+    return collector
+
+
+def make_folder(config: HindsightConfig, agent: Agent, flags: Sequence[str]) -> RunFolder:
+    """Return the run's folder, with its configuration."""
+    columns = (*COLUMNS, *(f"train/{name}" for name in agent.figures.values()), *(f"eval/{flag}" for flag in flags))
+    folder = RunFolder(config.out, columns=columns)
+    folder.write_config(dataclasses.asdict(config))
+    return folder
 
 
 def make_buffer(config: HindsightConfig, hindsight: Compose | None) -> TensorDictReplayBuffer:

@@ -43,7 +43,8 @@ class Report:
     """Rows of metrics, each written when its evaluation is done; training need not wait for it.
 
     Args:
-        folder: gets the rows, in order. Columns of which a row has nothing are NaN there.
+        folder: gets the rows, in order. Columns of which a row has nothing are NaN there; ``seconds`` counts from
+            here until the row is written, with its evaluation.
         logger: gets them as well.
 
     Attributes:

@@ -13,7 +13,7 @@ Every run writes into its own folder: ``config.json``, ``metrics.csv``, ``policy
 Metrics, one row an evaluation:
 
 ==============================  ====================================================================
-``frames``, ``seconds``         environment steps, and wall time since the start
+``frames``, ``seconds``         environment steps; wall time from the start until they were evaluated
 ``eval/success_rate``           deterministic policy, share of the fixed starts that reach the box
 ``eval/return``                 mean undiscounted return
 ``eval/episode_length``         mean steps

@@ -83,7 +83,7 @@ def test_on_the_cpu_the_network_itself_acts() -> None:
         assert agent.acting is agent.network
 
 
-@pytest.mark.parametrize("device", ["moon", "cuda:99"])
+@pytest.mark.parametrize("device", ["moon", "cuda:99", "meta", "privateuseone"])
 def test_a_device_that_is_not_there_is_refused(device: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=rf"device='{device}' cannot be used here.*choose 'cpu'"):
         ddpg_navigate.main(ddpg_navigate.Config(device=device, out=tmp_path / "run"))
@@ -99,7 +99,9 @@ def test_a_compiled_loss_learns_the_same_but_for_rounding() -> None:
         torch.manual_seed(0)
         agent = module.make_agent(config, actions)
         if compiled:
+            torch._dynamo.utils.counters.clear()
             agent.loss.compile(mode="default")
         learned.append([agent.update(rows(actions)).select("loss_actor", "loss_value").detach() for _ in range(3)])
     for plain, fast in zip(*learned, strict=True):
         torch.testing.assert_close(plain.to_dict(), fast.to_dict(), rtol=1e-4, atol=1e-5)
+    assert torch._dynamo.utils.counters["stats"]["unique_graphs"] > 0

@@ -1,7 +1,15 @@
 """A process of its own gives the figures that evaluation here and now gives, of the policy that was handed over."""
 
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
 import pytest
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import nn
 
@@ -10,6 +18,7 @@ from halgan_rl.evaluation_process import EvaluationProcess, evaluate_at_once
 from tests.test_evaluation import Corridor
 
 SEEDS = [2, 1, 0]
+ROOT = Path(__file__).parents[1]
 
 
 def make_policy(speed: float) -> TensorDictModule:
@@ -51,9 +60,71 @@ def test_what_evaluation_raises_arrives() -> None:
         process(make_policy(1.0)).result(timeout=60)
 
 
-def test_a_process_that_cannot_start_is_told_with_the_remedy() -> None:
-    with (
-        pytest.raises(RuntimeError, match="--no-background-evaluation"),
-        EvaluationProcess(unmakeable, seeds=SEEDS) as process,
-    ):
-        process(make_policy(1.0)).result(timeout=60)
+def test_a_process_that_cannot_start_is_told_with_the_remedy_before_training_begins() -> None:
+    process = EvaluationProcess(unmakeable, seeds=SEEDS)
+    with pytest.raises(RuntimeError, match="--no-background-evaluation"):
+        process.__enter__()
+
+
+def test_a_process_that_dies_is_told_with_the_remedy() -> None:
+    with pytest.raises(RuntimeError, match="has died"), EvaluationProcess(Corridor, seeds=SEEDS) as process:
+        process(Suicide()).result(timeout=60)
+
+
+class Suicide(nn.Module):
+    """Stands for whatever the system kills."""
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        os.kill(os.getpid(), signal.SIGKILL)
+        return tensordict
+
+
+def test_after_an_error_in_training_nothing_is_waited_for() -> None:
+    started = time.monotonic()
+    with pytest.raises(ValueError, match="lost"), EvaluationProcess(Slow, seeds=SEEDS) as process:
+        train_in_vain(process)
+    assert time.monotonic() - started < 30
+
+
+def train_in_vain(process: EvaluationProcess) -> None:
+    process(make_policy(1.0))
+    raise ValueError("lost")
+
+
+class Slow(Corridor):
+    """A minute a reset."""
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
+        time.sleep(60)
+        return super()._reset(tensordict)
+
+
+PARENT = """
+import os, time
+from halgan_rl.evaluation_process import EvaluationProcess
+from tests.test_evaluation import Corridor
+if __name__ == "__main__":
+    with EvaluationProcess(Corridor, seeds=[1]) as process:
+        print(process._started.result(), flush=True)
+        time.sleep(60)
+"""
+
+
+def test_the_process_ends_with_its_parent_however_that_ends(tmp_path: Path) -> None:
+    (tmp_path / "parent.py").write_text(PARENT)
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(tmp_path / "parent.py")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as parent:
+        child = int(parent.stdout.readline())
+        assert is_alive(child)
+        parent.kill()
+    deadline = time.monotonic() + 10
+    while is_alive(child) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not is_alive(child)
+
+
+def is_alive(pid: int) -> bool:
+    """Whether a process runs; one that has ended but was not waited for does not."""
+    stat = Path(f"/proc/{pid}/stat")
+    return stat.exists() and stat.read_text().rsplit(")", 1)[1].split()[0] != "Z"

@@ -2,6 +2,9 @@
 
 import dataclasses
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -96,14 +99,41 @@ def test_evaluation_in_the_background_changes_nothing(halgan_run: Path, tmp_path
     at_once, later = (read_metrics(path / "metrics.csv") for path in (halgan_run, tmp_path / "beside"))
     assert at_once.pop("seconds") != later.pop("seconds")
     assert repr(at_once) == repr(later)
+    assert len(set(at_once["eval/return"])) == 2  # the two policies that were handed over can be told apart
 
 
-def test_an_agent_learns_from_what_is_collected_in_the_background(halgan_run: Path, tmp_path: Path) -> None:
-    trained = run(tmp_path / "beside", background_collection=True)
-    assert differ(load_file(halgan_run / "policy.safetensors"), trained) == set(trained)
-    metrics = read_metrics(tmp_path / "beside" / "metrics.csv")
+def test_collection_in_the_background_repeats_itself_a_batch_behind(halgan_run: Path, tmp_path: Path) -> None:
+    one, other = (run(tmp_path / name, background_collection=True) for name in ("one", "other"))
+    assert differ(one, other) == set()
+    assert differ(one, load_file(halgan_run / "policy.safetensors")) == set(one)
+    metrics = read_metrics(tmp_path / "one" / "metrics.csv")
     assert metrics["frames"] == [80, 160]
     assert 0.05 < metrics["train/hallucinated_fraction"][-1] < 0.5
+
+
+FAILING = """
+import dataclasses, pathlib, sys
+from halgan_rl.training import Agent
+from recipes.ddpg_navigate import main
+from tests.recipes.test_ddpg_navigate import TINY
+
+def fail(agent, batch):
+    raise ValueError("lost")
+
+if __name__ == "__main__":
+    Agent.update = fail
+    both = {"background_collection": True, "background_evaluation": True}
+    main(dataclasses.replace(TINY, **both, out=pathlib.Path(sys.argv[1], "run")))
+"""
+
+
+def test_an_error_in_training_ends_the_processes_beside_it(tmp_path: Path) -> None:
+    (tmp_path / "failing.py").write_text(FAILING)
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    command = [sys.executable, str(tmp_path / "failing.py"), str(tmp_path)]
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    assert ended.returncode == 1
+    assert "ValueError: lost" in ended.stderr
 
 
 def test_seed_and_method_change_what_is_learned(halgan_run: Path, tmp_path: Path) -> None:
