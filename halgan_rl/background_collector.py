@@ -5,6 +5,7 @@ from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import AsyncCollector
+from torchrl.weight_update import SharedMemWeightSyncScheme
 
 
 class BackgroundCollector(AsyncCollector):
@@ -22,9 +23,21 @@ class BackgroundCollector(AsyncCollector):
 
     def __init__(self, make_env: Any, policy: TensorDictModuleBase, **settings: Any) -> None:
         self._latest = policy
-        super().__init__(make_env, copy.deepcopy(policy), update_at_each_batch=True, **settings)
+        self._sharing = SharedMemWeightSyncScheme()
+        super().__init__(
+            make_env,
+            copy.deepcopy(policy),
+            update_at_each_batch=True,
+            weight_sync_schemes={"policy": self._sharing},
+            **settings,
+        )
 
     def update_policy_weights_(self, *args: Any, **kwargs: Any) -> None:
         """Bring the copy up to date; TorchRL calls this while the worker waits."""
         del args, kwargs
         self.policy.load_state_dict(self._latest.state_dict())
+
+    def shutdown(self, *args: Any, **kwargs: Any) -> None:
+        """End the other process."""
+        super().shutdown(*args, **kwargs)
+        self._sharing.shutdown()  # which TorchRL (0.14.1) leaves to the interpreter's end, where it waits for ever
