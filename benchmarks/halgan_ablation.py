@@ -124,8 +124,10 @@ def write_report(ablation: Ablation, curves: dict[str, dict[str, list[float]]]) 
     report("ablation", [Table(title, (*header, paper), lines)], ablation.out)
     figure = Figure(figsize=(10, 6))
     axes = figure.subplots()
-    for name, curve in curves.items():
-        axes.plot([seconds / 60 for seconds in curve["seconds"]], curve["truth/mask_overlap"], label=name)
+    for number, (name, curve) in enumerate(curves.items()):
+        minutes = [seconds / 60 for seconds in curve["seconds"]]
+        style = "-" if number < 10 else "--"  # there are ten colours
+        axes.plot(minutes, curve["truth/mask_overlap"], style, color=f"C{number}", label=name)
     axes.set(xlabel="minutes of training", ylabel="overlap with the goal's true mask", ylim=(0, 1))
     axes.legend(fontsize="small")
     figure.savefig(ablation.out / "ablation.png", dpi=100, bbox_inches="tight")
