@@ -171,5 +171,6 @@ def train(
         progress.update(rollout.numel())
         progress.set_postfix(success=f"{report.success:.0%}", updates=updates, refresh=False)
     report.write(wait=True)
+    progress.set_postfix(success=f"{report.success:.0%}", updates=updates)
     progress.close()
     return policy.cpu()
