@@ -82,7 +82,7 @@ VARIANTS = {
     "stock composer camera": stock_camera,
 }
 ALL_VARIANTS = VARIANTS | {"ours, Gymnasium": gymnasium_face, "MiniWorld OneRoom, Gymnasium": miniworld}
-"""Beside navigate-2m, the room that is most like MiniWorld's."""
+"""What navigate-2m, the room that is most like MiniWorld's, is measured with."""
 
 
 def stepping(environment: Environment, steps: int) -> Callable[[], None]:

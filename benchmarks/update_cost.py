@@ -41,7 +41,7 @@ PAINTERS: dict[str, dict[str, Any]] = {
 class Benchmark:
     """What hallucination costs a DDPG update."""
 
-    rounds: int = 7
+    rounds: int = 21
     """Alternating rounds; the median is reported."""
     updates: int = 20
     """Updates a round."""

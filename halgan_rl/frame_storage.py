@@ -314,7 +314,8 @@ class FrameStorage(LazyTensorStorage):
         _LOGGER.info("FrameStorage takes %s: %s", _readable(nbytes), remedy)
         _check_room(nbytes, slots * OVERHEAD, self.scratch_dir, remedy)
         if self.scratch_dir is None:
-            # NumPy asks the system for huge pages: random reads are a tenth faster than from PyTorch's memory.
+            # NumPy asks the system for huge pages: random reads are a tenth faster than from PyTorch's memory, though
+            # the first writing is slower.
             frames = torch.from_numpy(np.empty((slots, size), dtype=np.uint8))
             empty = partial(torch.empty_like, memory_format=torch.contiguous_format)
             self._storage = row.expand(self.max_size).apply(empty)
