@@ -36,15 +36,15 @@ from envs.torchrl_env import ComposerEnv
 from halgan_rl.evaluation_process import evaluate_at_once
 from halgan_rl.experiment import (
     EVALUATION_SEED,
-    HindsightConfig,
     make_buffer,
     make_collector,
+    make_folder,
     make_hallucinator,
     make_hindsight,
 )
+from halgan_rl.hindsight_config import HindsightConfig
 from halgan_rl.metrics import Report
-from halgan_rl.run_folder import RunFolder
-from halgan_rl.training import COLUMNS, Agent, Schedule, train
+from halgan_rl.training import Agent, Schedule, train
 from recipes import ddpg_navigate, ddpg_pick_place, ddqn_pebble
 
 RECIPES = {
@@ -146,7 +146,7 @@ def make_round(recipe: Any, benchmark: Benchmark, out: Path, **changes: Any) -> 
         changes: of the configuration.
     """
     config: HindsightConfig = dataclasses.replace(
-        recipe.PRESETS["default"], warmup_frames=benchmark.rows, total_frames=ENDLESS, **changes
+        recipe.PRESETS["default"], warmup_frames=benchmark.rows, total_frames=ENDLESS, out=out, **changes
     )
     hallucinator = make_hallucinator(config, envs)
     env, evaluation_env = envs.make(config.environment, seed=config.seed), envs.make(config.environment)
@@ -169,7 +169,7 @@ def make_round(recipe: Any, benchmark: Benchmark, out: Path, **changes: Any) -> 
         schedule=Schedule(benchmark.frames, 0, config.frames_per_update, benchmark.frames),
         policy_average=config.policy_average,
         evaluate=watch.timed(EVALUATION, partial(evaluate_at_once, evaluation_env, seeds=starts)),
-        report=Report(RunFolder(out, columns=(*COLUMNS, *(f"train/{name}" for name in agent.figures.values())))),
+        report=Report(make_folder(config, agent, ())),
         save=lambda network: None,
         label=config.environment,
     )

@@ -20,7 +20,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from benchmarks.rows import EPISODE, channels_first
-from halgan_rl.experiment import HindsightConfig
+from halgan_rl.hindsight_config import HindsightConfig
 from halgan_rl.models.agents import Vision
 from halgan_rl.models.halgan import LEAK
 

@@ -41,7 +41,8 @@ from benchmarks.rounds import alternate, seconds_a_call, warm_heap
 from benchmarks.rows import Rows, channels_first, plain
 from benchmarks.tables import Table, report
 from halgan_rl import ddpg, ddqn
-from halgan_rl.experiment import HindsightConfig, make_buffer
+from halgan_rl.experiment import make_buffer
+from halgan_rl.hindsight_config import HindsightConfig
 from halgan_rl.models.agents import Actor, Critic, Downsample, QNetwork, Vision, greedy_policy
 from halgan_rl.models.pixels import to_float
 from halgan_rl.training import Agent

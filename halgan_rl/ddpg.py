@@ -8,8 +8,8 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.modules import AdditiveGaussianModule, EGreedyModule
 from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
 
-from halgan_rl import experiment
-from halgan_rl.experiment import HindsightConfig
+from halgan_rl import hindsight_config
+from halgan_rl.hindsight_config import HindsightConfig
 from halgan_rl.models.agents import Actor, Critic, deterministic_policy
 from halgan_rl.objectives import ClippedTD0Estimator, UnsaturatedDDPGLoss
 from halgan_rl.training import Agent, on_cpu
@@ -31,7 +31,7 @@ class DDPGConfig(HindsightConfig):
     """Standard deviation of the Gaussian noise on the actions."""
 
 
-PAPER = experiment.PAPER | {
+PAPER = hindsight_config.PAPER | {
     "actor_learning_rate": 1e-5,
     "critic_learning_rate": 1e-4,
     "preactivation_weight": 0.0,

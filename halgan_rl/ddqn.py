@@ -8,7 +8,7 @@ from torchrl.data import OneHot, TensorSpec
 from torchrl.modules import EGreedyModule
 from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
 
-from halgan_rl.experiment import HindsightConfig
+from halgan_rl.hindsight_config import HindsightConfig
 from halgan_rl.models.agents import QNetwork, greedy_policy
 from halgan_rl.objectives import ClippedTD0Estimator
 from halgan_rl.training import Agent, on_cpu

@@ -23,7 +23,8 @@ from pathlib import Path
 
 import envs
 from halgan_rl.ddqn import DDQNConfig, make_agent
-from halgan_rl.experiment import PAPER, run
+from halgan_rl.experiment import run
+from halgan_rl.hindsight_config import PAPER
 from halgan_rl.presets import parse_config
 
 

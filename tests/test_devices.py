@@ -3,7 +3,6 @@ only, and refuses to be mixed with the CPU."""
 
 import copy
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +13,11 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, OneHot, TensorSpec
 
 from halgan_rl import ddpg, ddqn
-from halgan_rl.experiment import HindsightConfig, check_device
-from halgan_rl.training import Agent
+from halgan_rl.experiment import check_device
+from halgan_rl.hindsight_config import HindsightConfig
 from recipes import ddpg_navigate, ddqn_pebble
 from tests.recipes.test_ddpg_navigate import TINY
 
-MakeAgent = Callable[[Any, TensorSpec], Agent]
 ALGORITHMS: dict[str, tuple[Any, HindsightConfig, TensorSpec]] = {
     "DDPG": (ddpg, ddpg_navigate.Config(), Bounded(-1.0, 1.0, (2,))),
     "DDQN": (ddqn, ddqn_pebble.Config(), OneHot(4, dtype=torch.int64)),
