@@ -6,7 +6,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import torch
 from gymnasium import spaces
 from stable_baselines3 import DDPG, DQN
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -19,9 +18,9 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from benchmarks.plain_vision import PlainVision
 from benchmarks.rows import EPISODE, channels_first
 from halgan_rl.hindsight_config import HindsightConfig
-from halgan_rl.models.agents import Vision
 from halgan_rl.models.halgan import LEAK
 
 ACTIONS = spaces.Box(-1, 1, (2,), np.float32)
@@ -120,11 +119,11 @@ def nbytes(buffer: ReplayBuffer) -> int:
 
 
 class Features(BaseFeaturesExtractor):
-    """The convolutions of :class:`halgan_rl.models.agents.Vision`, in PyTorch's default memory format."""
+    """What our agents see with, of plain convolutions."""
 
     def __init__(self, observation_space: spaces.Box, downsample: str) -> None:
         super().__init__(observation_space, features_dim=512)
-        self.layers = Vision(downsample).layers.to(memory_format=torch.contiguous_format)
+        self.layers = PlainVision(downsample).layers
 
     def forward(self, observations: Tensor) -> Tensor:
         """Return features ``[N, 512]``."""

@@ -37,13 +37,15 @@ from torchrl.data import Bounded, LazyTensorStorage, OneHot, TensorDictReplayBuf
 from torchrl.objectives import DDPGLoss, DQNLoss, LossModule, SoftUpdate, ValueEstimators
 
 from benchmarks import sb3_peers
+from benchmarks.plain_vision import PlainVision
 from benchmarks.rounds import alternate, seconds_a_call, warm_heap
 from benchmarks.rows import Rows, channels_first, plain
 from benchmarks.tables import Table, report
 from halgan_rl import ddpg, ddqn
 from halgan_rl.experiment import make_buffer
 from halgan_rl.hindsight_config import HindsightConfig
-from halgan_rl.models.agents import Actor, Critic, Downsample, QNetwork, Vision, greedy_policy
+from halgan_rl.models.agents import Actor, Critic, QNetwork, Vision, greedy_policy
+from halgan_rl.models.halving import Downsample
 from halgan_rl.models.pixels import to_float
 from halgan_rl.training import Agent
 from recipes import ddpg_navigate, ddqn_pebble
@@ -104,21 +106,9 @@ def make_single_dqn(config: ddqn.DDQNConfig, actions: TensorSpec) -> Agent:
     return agent
 
 
-class ContiguousVision(Vision):
-    """Our convolutions on images uint8 ``[N, 3, 64, 64]``, in PyTorch's default memory format."""
-
-    def __init__(self, downsample: Downsample) -> None:
-        super().__init__(downsample)
-        self.to(memory_format=torch.contiguous_format)
-
-    def forward(self, pixels: Tensor) -> Tensor:
-        """Return features ``[N, 512]``."""
-        return self.layers(pixels.float() / 127.5 - 1)
-
-
 def contiguous(network: nn.Module, config: HindsightConfig) -> nn.Module:
-    """Return one of our networks, changed to images channels first."""
-    network.vision = ContiguousVision(config.downsample)
+    """Return one of our networks, changed to images channels first and plain convolutions."""
+    network.vision = PlainVision(config.downsample)
     return network
 
 

@@ -3,15 +3,17 @@
 import dataclasses
 
 import torch
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictSequential
 from torchrl.data import Bounded, TensorSpec
 from torchrl.modules import AdditiveGaussianModule, EGreedyModule
-from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
+from torchrl.objectives import DDPGLoss, ValueEstimators
 
 from halgan_rl import hindsight_config
 from halgan_rl.hindsight_config import HindsightConfig
 from halgan_rl.models.agents import Actor, Critic, deterministic_policy
-from halgan_rl.objectives import ClippedTD0Estimator, UnsaturatedDDPGLoss
+from halgan_rl.objectives import ClippedTD0Estimator
+from halgan_rl.one_pass_losses import OnePassDDPGLoss
+from halgan_rl.soft_update import FusedSoftUpdate
 from halgan_rl.training import Agent, on_cpu
 
 
@@ -57,14 +59,10 @@ def make_agent(config: DDPGConfig, action_spec: TensorSpec) -> Agent:
     size, downsample = action_spec.shape[-1], config.downsample
     network = Actor(size, downsample=downsample, small_output=config.small_output).to(config.device)
     acting = on_cpu(network)
-    critic = TensorDictModule(
-        Critic(size, downsample=downsample).to(config.device),
-        in_keys=["pixels", "action"],
-        out_keys=["state_action_value"],
-    )
+    critic = Critic(size, downsample=downsample).to(config.device)
     noise = AdditiveGaussianModule(action_spec, sigma_init=config.noise, sigma_end=config.noise)
     epsilon = EGreedyModule(action_spec, config.epsilon_start, config.epsilon_end, config.epsilon_frames)
-    loss = make_loss(config, deterministic_policy(network), critic)
+    loss = make_loss(config, network, critic)
     return Agent(
         network=network,
         acting=acting,
@@ -73,16 +71,14 @@ def make_agent(config: DDPGConfig, action_spec: TensorSpec) -> Agent:
         epsilon=epsilon,
         loss=loss,
         optimizer=make_optimizer(config, loss),
-        target_updater=SoftUpdate(loss, tau=config.target_rate),
+        target_updater=FusedSoftUpdate(loss, tau=config.target_rate),
         figures=FIGURES,
     )
 
 
-def make_loss(config: DDPGConfig, actor: TensorDictModule, critic: TensorDictModule) -> DDPGLoss:
+def make_loss(config: DDPGConfig, actor: Actor, critic: Critic) -> DDPGLoss:
     """Return TorchRL's DDPG loss with the targets that the configuration asks for."""
-    loss = UnsaturatedDDPGLoss(
-        actor, critic, delay_actor=True, delay_value=True, preactivation_weight=config.preactivation_weight
-    )
+    loss = OnePassDDPGLoss(actor, critic, preactivation_weight=config.preactivation_weight)
     if config.clip_targets:
         estimator = ClippedTD0Estimator(
             low=-1.0, high=1.0, gamma=config.discount, value_network=loss.actor_critic, device=config.device

@@ -6,11 +6,13 @@ import torch
 from tensordict.nn import TensorDictSequential
 from torchrl.data import OneHot, TensorSpec
 from torchrl.modules import EGreedyModule
-from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
+from torchrl.objectives import DQNLoss, ValueEstimators
 
 from halgan_rl.hindsight_config import HindsightConfig
 from halgan_rl.models.agents import QNetwork, greedy_policy
 from halgan_rl.objectives import ClippedTD0Estimator
+from halgan_rl.one_pass_losses import OnePassDQNLoss
+from halgan_rl.soft_update import FusedSoftUpdate
 from halgan_rl.training import Agent, on_cpu
 
 
@@ -36,7 +38,7 @@ def make_agent(config: DDQNConfig, action_spec: TensorSpec) -> Agent:
     network = QNetwork(action_spec.shape[-1], downsample=config.downsample).to(config.device)
     acting = on_cpu(network)
     epsilon = EGreedyModule(action_spec, config.epsilon_start, config.epsilon_end, config.epsilon_frames)
-    loss = make_loss(config, greedy_policy(network))
+    loss = make_loss(config, network)
     return Agent(
         network=network,
         acting=acting,
@@ -45,14 +47,14 @@ def make_agent(config: DDQNConfig, action_spec: TensorSpec) -> Agent:
         epsilon=epsilon,
         loss=loss,
         optimizer=torch.optim.Adam(loss.value_network_params.values(True, True), config.learning_rate, fused=True),
-        target_updater=SoftUpdate(loss, tau=config.target_rate),
+        target_updater=FusedSoftUpdate(loss, tau=config.target_rate),
         figures={"loss": "loss"},
     )
 
 
-def make_loss(config: DDQNConfig, actor: TensorDictSequential) -> DQNLoss:
+def make_loss(config: DDQNConfig, network: QNetwork) -> DQNLoss:
     """Return TorchRL's double-DQN loss with the targets that the configuration asks for."""
-    loss = DQNLoss(actor, delay_value=True, double_dqn=True, action_space="one_hot")
+    loss = OnePassDQNLoss(network)
     if config.clip_targets:
         estimator = ClippedTD0Estimator(
             low=-1.0, high=1.0, gamma=config.discount, value_network=loss.value_network, device=config.device

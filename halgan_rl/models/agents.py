@@ -1,6 +1,6 @@
 """The agents' networks of the paper (Sahni et al., NeurIPS 2019, appendix), all on the camera image alone."""
 
-from typing import Literal
+from collections.abc import Sequence
 
 import torch
 from tensordict import NestedKey
@@ -9,9 +9,8 @@ from torch import Tensor, nn
 from torchrl.modules import QValueModule
 
 from halgan_rl.models.halgan import LEAK
+from halgan_rl.models.halving import Downsample, Halving, halve
 from halgan_rl.models.pixels import to_float
-
-Downsample = Literal["stride", "max_pool"]
 
 _VISION_SIZE = 512
 _HIDDEN_SIZE = 32
@@ -33,14 +32,17 @@ class Vision(nn.Module):
 
     def __init__(self, downsample: Downsample = "stride") -> None:
         super().__init__()
-        if downsample not in ("stride", "max_pool"):
-            raise ValueError(f"downsample={downsample!r} is unknown: choose 'stride' or 'max_pool'")
-        pooled = downsample == "max_pool"
-        layers: list[nn.Module] = []
-        for inputs, outputs in ((3, 4), (4, 8), (8, 16), (16, 32)):
-            layers += [nn.Conv2d(inputs, outputs, 5, stride=1 if pooled else 2, padding=2), nn.LeakyReLU(LEAK)]
-            layers += [nn.MaxPool2d(2)] if pooled else []
-        self.layers = nn.Sequential(*layers, nn.Flatten())
+        self.layers = nn.Sequential(
+            Halving(3, 4, 5, downsample=downsample, blocks_out=2),
+            nn.LeakyReLU(LEAK),
+            Halving(4, 8, 5, downsample=downsample, blocks_in=2),
+            nn.LeakyReLU(LEAK),
+            Halving(8, 16, 5, downsample=downsample),
+            nn.LeakyReLU(LEAK),
+            Halving(16, 32, 5, downsample=downsample),
+            nn.LeakyReLU(LEAK),
+            nn.Flatten(),
+        )
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, pixels: Tensor) -> Tensor:
@@ -49,9 +51,31 @@ class Vision(nn.Module):
         Raises:
             ValueError: if the images have another shape or type.
         """
-        if pixels.shape[-3:] != (64, 64, 3) or pixels.dtype != torch.uint8:
-            raise ValueError(f"pixels must be uint8 [..., 64, 64, 3], got {pixels.dtype} {list(pixels.shape)}")
-        return self.layers(to_float(pixels))
+        return see(pixels, [self])[0]
+
+
+def see(pixels: Tensor, visions: Sequence[Vision]) -> tuple[Tensor, ...]:
+    """Return what several networks see in the same images, in one pass: faster than each alone, same but for rounding.
+
+    Args:
+        pixels: uint8 ``[..., 64, 64, 3]``.
+        visions: all with the same down-sampling.
+
+    Returns:
+        Features ``[N, 512]`` for each network, N the product of the leading dimensions.
+
+    Raises:
+        ValueError: if the images have another shape or type.
+    """
+    if pixels.shape[-3:] != (64, 64, 3) or pixels.dtype != torch.uint8:
+        raise ValueError(f"pixels must be uint8 [..., 64, 64, 3], got {pixels.dtype} {list(pixels.shape)}")
+    features = to_float(pixels)
+    for depth, layers in enumerate(zip(*(vision.layers for vision in visions), strict=True)):
+        if isinstance(layers[0], Halving):
+            features = halve(features, layers, shared=depth == 0)
+        else:
+            features = layers[0](features)
+    return features.chunk(len(visions), -1)
 
 
 class Actor(nn.Module):
@@ -129,8 +153,11 @@ class Critic(nn.Module):
 
     def forward(self, pixels: Tensor, action: Tensor) -> Tensor:
         """Return values ``[..., 1]`` for images uint8 ``[..., 64, 64, 3]`` and actions ``[..., A]``."""
-        joined = torch.cat([self.vision(pixels), action.reshape(-1, action.shape[-1])], -1)
-        return self.head(joined).reshape(*pixels.shape[:-3], 1)
+        return self.judge(self.vision(pixels), action.reshape(-1, action.shape[-1])).reshape(*pixels.shape[:-3], 1)
+
+    def judge(self, features: Tensor, action: Tensor) -> Tensor:
+        """Return values ``[N, 1]`` for features ``[N, 512]`` and actions ``[N, A]``."""
+        return self.head(torch.cat([features, action], -1))
 
 
 class QNetwork(nn.Module):

@@ -1,0 +1,164 @@
+"""TorchRL's losses of our agents, with as few passes through their convolutions as there can be.
+
+The values and gradients are those of the losses that they derive from, but for rounding. Those ask each network for
+itself, and the critic twice about the same frame; here networks that see the same frames share a pass
+(:func:`halgan_rl.models.agents.see`), and nothing is asked twice. Target networks are kept as modules, whose parameters
+are the loss's target parameters: filling a module with parameters at each call costs about as much as what it computes.
+"""
+
+import copy
+from functools import cached_property
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModule, dispatch
+from torch import Tensor, nn
+from torch.func import functional_call
+from torchrl.objectives import DQNLoss
+from torchrl.objectives.utils import distance_loss
+
+from halgan_rl.models.agents import Actor, Critic, QNetwork, deterministic_policy, greedy_policy, see
+from halgan_rl.objectives import UnsaturatedDDPGLoss
+
+
+class OnePassDDPGLoss(UnsaturatedDDPGLoss):
+    """:class:`halgan_rl.objectives.UnsaturatedDDPGLoss` of an actor and a critic, with a target network each.
+
+    Args:
+        actor: its parameters are trained where they are.
+        critic: likewise, with the same down-sampling.
+        pixels_key: images uint8 ``[..., 64, 64, 3]``, also below ``"next"``.
+        action_key: actions taken, ``[..., A]``.
+        **kwargs: see :class:`halgan_rl.objectives.UnsaturatedDDPGLoss`.
+    """
+
+    def __init__(
+        self,
+        actor: Actor,
+        critic: Critic,
+        *,
+        pixels_key: NestedKey = "pixels",
+        action_key: NestedKey = "action",
+        preactivation_key: NestedKey = "preactivation",
+        **kwargs: Any,
+    ) -> None:
+        policy = deterministic_policy(
+            actor, pixels_key=pixels_key, preactivation_key=preactivation_key, action_key=action_key
+        )
+        judge = TensorDictModule(critic, in_keys=[pixels_key, action_key], out_keys=["state_action_value"])
+        super().__init__(
+            policy, judge, delay_actor=True, delay_value=True, preactivation_key=preactivation_key, **kwargs
+        )
+        self.pixels_key, self.action_key = pixels_key, action_key
+        self._online = actor, critic  # a tuple, or they would be registered as modules a second time
+        _ = self._cached_targets  # now: where the loss is compiled is no place to copy networks
+
+    @cached_property
+    def _cached_targets(self) -> tuple[Actor, Critic]:
+        """The target networks, until TorchRL erases what begins like this because the parameters may have moved."""
+        children, (actor, critic) = dict(self.named_children()), self._online
+        actor_parameters = children["target_actor_network_params"]["module", "0", "module"]
+        critic_parameters = children["target_value_network_params"]["module"]
+        return filled(actor, actor_parameters), filled(critic, critic_parameters)
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Return the losses and figures of TorchRL's DDPGLoss; write the priorities."""
+        shape = tensordict.shape
+        target = self._target_value(tensordict)
+        actor, critic = self._online
+        pixels, action = tensordict.get(self.pixels_key), tensordict.get(self.action_key).detach()
+        actor_features, critic_features = see(pixels, [actor.vision, critic.vision])
+        value = critic.judge(critic_features, action.flatten(0, -2)).reshape(shape)
+        preactivation = actor.head(actor_features)
+        frozen = {name: parameter.detach() for name, parameter in critic.head.named_parameters()}
+        joined = torch.cat([critic_features.detach(), preactivation.tanh()], -1)
+        reached = functional_call(critic.head, frozen, joined).squeeze(-1)
+        price = self.preactivation_weight * preactivation.square().mean(-1)
+
+        td_error = (value - target).square().detach()
+        tensordict.set(self.tensor_keys.priority, td_error, inplace=True)
+        losses = {
+            "loss_actor": (price - reached).reshape(shape),
+            "loss_value": distance_loss(value, target, loss_function=self.loss_function),
+        }
+        weights = self._maybe_get_priority_weight(tensordict)
+        losses = {
+            name: self._reduce_loss(loss, tensordict=tensordict, weights=weights) for name, loss in losses.items()
+        }
+        predicted = value.detach()
+        return TensorDict(
+            {
+                **losses,
+                "td_error": td_error,
+                "pred_value": predicted,
+                "target_value": target,
+                "target_value_max": target.max(),
+                "pred_value_max": predicted.max(),
+            }
+        )
+
+    @torch.no_grad()
+    def _target_value(self, tensordict: TensorDictBase) -> Tensor:
+        actor, critic = self._cached_targets
+        actor_features, critic_features = see(tensordict.get(("next", self.pixels_key)), [actor.vision, critic.vision])
+        value = critic.judge(critic_features, actor.head(actor_features).tanh())
+        value = value.reshape(*tensordict.shape, 1)
+        return self.value_estimator.value_estimate(tensordict, next_value=value).squeeze(-1)
+
+
+class OnePassDQNLoss(DQNLoss):
+    """TorchRL's DQNLoss of a network of action values, with one-hot actions and a target network.
+
+    Args:
+        network: its parameters are trained where they are.
+        double: whether the network itself chooses the action that the target network values (van Hasselt et al., "Deep
+            Reinforcement Learning with Double Q-learning", 2016).
+        pixels_key: images uint8 ``[..., 64, 64, 3]``, also below ``"next"``.
+        **kwargs: see :class:`~torchrl.objectives.DQNLoss`.
+    """
+
+    def __init__(
+        self, network: QNetwork, *, double: bool = True, pixels_key: NestedKey = "pixels", **kwargs: Any
+    ) -> None:
+        policy = greedy_policy(network, pixels_key=pixels_key)
+        super().__init__(policy, delay_value=True, double_dqn=double, action_space="one_hot", **kwargs)
+        self.pixels_key = pixels_key
+        self._online = (network,)  # a tuple, or it would be registered as a module a second time
+        _ = self._cached_targets  # now: where the loss is compiled is no place to copy networks
+
+    @cached_property
+    def _cached_targets(self) -> tuple[QNetwork]:
+        """The target network, until TorchRL erases what begins like this because the parameters may have moved."""
+        parameters = dict(self.named_children())["target_value_network_params"]["module", "0", "module"]
+        return (filled(self._online[0], parameters),)
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Return the loss of TorchRL's DQNLoss; write the priorities."""
+        target = self._target_value(tensordict)
+        values = self._online[0](tensordict.get(self.pixels_key))
+        value = (values * tensordict.get(self.tensor_keys.action).to(values.dtype)).sum(-1)
+        error = (value - target).square().detach()
+        tensordict.set(self.tensor_keys.priority, error.unsqueeze(-1), inplace=True)
+        loss = distance_loss(value, target, self.loss_function)
+        weights = self._maybe_get_priority_weight(tensordict)
+        return TensorDict({"loss": self._reduce_loss(loss, tensordict=tensordict, weights=weights)})
+
+    @torch.no_grad()
+    def _target_value(self, tensordict: TensorDictBase) -> Tensor:
+        pixels = tensordict.get(("next", self.pixels_key))
+        networks = [*self._cached_targets, *(self._online if self.double_dqn else ())]
+        features = see(pixels, [network.vision for network in networks])
+        valued, *chosen = (network.head(seen) for network, seen in zip(networks, features, strict=True))
+        best = (chosen[0] if chosen else valued).argmax(-1, keepdim=True)
+        value = valued.gather(-1, best).reshape(*tensordict.shape, 1)
+        return self.value_estimator.value_estimate(tensordict, next_value=value).squeeze(-1)
+
+
+def filled(network: nn.Module, parameters: TensorDictBase | TensorDictParams) -> Any:
+    """Return a copy of a network that has other parameters: these very tensors, so that it follows their changes."""
+    copied = copy.deepcopy(network)
+    parameters.to_module(copied)
+    return copied
