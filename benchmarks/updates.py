@@ -5,20 +5,19 @@ Usage::
     python -m benchmarks.updates
 
 Ours is the recipe's update: sampling from a ``FrameStorage``, TorchRL's loss with clipped targets (and, in DDPG, the
-price on the actor's pre-activations), one fused Adam, images and convolutions in ``channels_last``. Stable-Baselines3's
-is ``DDPG.train`` or ``DQN.train`` with our convolutions as features extractor, in DDPG one for each of actor and critic
+price on the actor's pre-activations) and shared passes through the convolutions, one fused Adam. Stable-Baselines3's is
+``DDPG.train`` or ``DQN.train`` with plain convolutions as features extractor, in DDPG one for each of actor and critic
 (it has one learning rate for both). TorchRL's is ``DDPGLoss`` or ``DQNLoss``, an Adam for each network and
-``SoftUpdate`` on a ``LazyTensorStorage`` of images channels first. Both peers' networks are in PyTorch's default memory
-format; the numbers of parameters are compared before measuring. One thread, medians of processor time in alternating
-rounds.
+``SoftUpdate`` on a ``LazyTensorStorage`` of images channels first. Both peers' networks are plain layers in PyTorch's
+default memory format that compute the same function; the numbers of parameters are compared before measuring. One
+thread, medians of processor time in alternating rounds.
 
 Stable-Baselines3's DQN is not double: it does not ask the online network about next frames, one forward pass less. So
-ours is measured without that pass as well ("ours, not double"). Its ``train`` leaves the target network to the steps in
-the environment; here the target network follows at each update, as in the others.
+ours is measured without that pass as well, and compared with that. Its ``train`` leaves the target network to the steps
+in the environment; here the target network follows at each update, as in the others.
 
-"Convolutions alone" are the passes that no update of these networks can spare, forward and, where they learn, backward,
-on images that are ready: what an update would take if all else (sampling, heads, losses, Adam, targets) cost nothing.
-Ours makes one pass more in DDPG: TorchRL's loss asks the critic for the features of a frame twice.
+"Our convolutions alone" are the passes of our update, forward and, where they learn, backward, from the images on:
+what it would take if all else (sampling, heads, losses, Adam, targets) cost nothing.
 """
 
 import dataclasses
@@ -44,9 +43,8 @@ from benchmarks.tables import Table, report
 from halgan_rl import ddpg, ddqn
 from halgan_rl.experiment import make_buffer
 from halgan_rl.hindsight_config import HindsightConfig
-from halgan_rl.models.agents import Actor, Critic, QNetwork, Vision, greedy_policy
+from halgan_rl.models.agents import Actor, Critic, QNetwork, Vision, greedy_policy, see
 from halgan_rl.models.halving import Downsample
-from halgan_rl.models.pixels import to_float
 from halgan_rl.training import Agent
 from recipes import ddpg_navigate, ddqn_pebble
 
@@ -83,17 +81,21 @@ def ours(
     return lambda: agent.update(buffer.sample()), count_parameters(agent.loss)
 
 
-def convolutions(config: HindsightConfig, rows: TensorDict, learning: Sequence[bool]) -> Update:
-    """Return the convolutions of an update: one pass for each entry, and back where it is True."""
-    images = to_float(rows["pixels"][: config.batch_size])
-    networks = [Vision(config.downsample) for _ in learning]
+Passes = Sequence[tuple[int, bool]]
+"""Passes through convolutions: how many networks share one, and whether they learn by it."""
+
+
+def convolutions(config: HindsightConfig, rows: TensorDict, passes: Passes) -> Update:
+    """Return the convolutions of our update: forward, and back where they learn."""
+    pixels = rows["pixels"][: config.batch_size]
+    networks = [[Vision(config.downsample) for _ in range(count)] for count, _ in passes]
 
     def run() -> None:
-        for network, learns in zip(networks, learning, strict=True):
+        for visions, (_, learns) in zip(networks, passes, strict=True):
             with torch.set_grad_enabled(learns):
-                features = network.layers(images)
+                features = see(pixels, visions)
             if learns:
-                features.backward(torch.ones_like(features))
+                torch.autograd.backward(features, [torch.ones_like(seen) for seen in features])
 
     return run
 
@@ -102,7 +104,6 @@ def make_single_dqn(config: ddqn.DDQNConfig, actions: TensorSpec) -> Agent:
     """Return the recipe's agent, with targets that are not double."""
     agent = ddqn.make_agent(config, actions)
     agent.loss.double_dqn = False
-    agent.loss.value_estimator.set_keys(value=agent.loss.tensor_keys.value)  # which it now asks for itself
     return agent
 
 
@@ -188,13 +189,13 @@ class Algorithm:
         config: the recipe's.
         actions: of its environment.
         variants: ours and its peers.
-        passes: through convolutions that an update needs: whether they learn.
+        passes: of our update.
     """
 
     config: HindsightConfig
     actions: TensorSpec
     variants: Mapping[str, Variant]
-    passes: Sequence[bool]
+    passes: Passes
 
 
 DRIVE, CHOICE = Bounded(-1.0, 1.0, (2,)), OneHot(4, dtype=torch.int64)
@@ -207,7 +208,7 @@ ALGORITHMS = {
             "SB3 DDPG.train": sb3_ddpg,
             "torchrl plain loop": partial(torchrl_loop, torchrl_ddpg),
         },
-        passes=(True, True, False, False),  # actor and critic at s, their targets at s'
+        passes=((2, True), (2, False)),  # actor and critic at s, their targets at s'
     ),
     "DDQN": Algorithm(
         ddqn_pebble.Config(hindsight="none"),
@@ -218,7 +219,7 @@ ALGORITHMS = {
             "SB3 DQN.train, not double": sb3_dqn,
             "torchrl plain loop": partial(torchrl_loop, torchrl_ddqn),
         },
-        passes=(True, False, False),  # the network at s and at s', its target at s'
+        passes=((1, True), (2, False)),  # the network at s; with its target at s'
     ),
 }
 
@@ -241,7 +242,7 @@ def make_updates(algorithm: Algorithm, rows: TensorDict, **changes: Any) -> dict
     if len(set(counts.values())) != 1:
         raise RuntimeError(f"the networks differ, this would compare apples with pears: {counts}")
     bound = convolutions(config, rows, algorithm.passes)
-    return {name: run for name, (run, _) in made.items()} | {"convolutions alone": bound}
+    return {name: run for name, (run, _) in made.items()} | {"our convolutions alone": bound}
 
 
 Case = tuple[str, str, int, str]
@@ -259,6 +260,11 @@ def measure(benchmark: Benchmark) -> dict[Case, float]:
         for name, run in make_updates(made, rows, batch_size=size, downsample=downsample).items():
             measures[algorithm, downsample, size, name] = partial(seconds_a_call, run, benchmark.updates)
     return alternate(measures, benchmark.rounds)
+
+
+def our(name: str) -> str:
+    """Return which of our variants another one is compared with."""
+    return "ours, not double" if name.endswith("not double") else "ours"
 
 
 HEADER = (
@@ -280,7 +286,10 @@ def main(benchmark: Benchmark) -> None:
     )
     lines = [
         [algorithm, downsample, str(size), name, f"{value * 1e3:.1f}", f"{1 / value:.0f}"]
-        + [f"{value / seconds[algorithm, other, size, 'ours']:.2f}" for other in (downsample, benchmark.downsamples[0])]
+        + [
+            f"{value / seconds[algorithm, other, size, our(name)]:.2f}"
+            for other in (downsample, benchmark.downsamples[0])
+        ]
         for (algorithm, downsample, size, name), value in seconds.items()
     ]
     report("updates", [Table(title, HEADER, lines)])

@@ -71,10 +71,8 @@ def see(pixels: Tensor, visions: Sequence[Vision]) -> tuple[Tensor, ...]:
         raise ValueError(f"pixels must be uint8 [..., 64, 64, 3], got {pixels.dtype} {list(pixels.shape)}")
     features = to_float(pixels)
     for depth, layers in enumerate(zip(*(vision.layers for vision in visions), strict=True)):
-        if isinstance(layers[0], Halving):
-            features = halve(features, layers, shared=depth == 0)
-        else:
-            features = layers[0](features)
+        halving = isinstance(layers[0], Halving)
+        features = halve(features, layers, shared=depth == 0) if halving else layers[0](features)
     return features.chunk(len(visions), -1)
 
 

@@ -8,7 +8,7 @@ kernel holds the same weights, shifted for each neighbour, and zeros between the
 import math
 from collections.abc import Sequence
 from functools import cache
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -43,6 +43,8 @@ class Halving(nn.Conv2d):
         torch.Size([5, 16, 16, 16])
     """
 
+    bias: Tensor
+
     def __init__(
         self,
         in_channels: int,
@@ -60,22 +62,23 @@ class Halving(nn.Conv2d):
             raise ValueError(
                 f"blocks_in={blocks_in} must divide the padding, {padding}, and 2 * blocks_out, {2 * blocks_out}"
             )
-        self.pool = 2 if downsample == "max_pool" else 1
-        super().__init__(in_channels, out_channels, kernel_size, stride=2 // self.pool, padding=padding)
-        self.blocks_in, self.blocks_out = blocks_in, blocks_out
+        pool = 2 if downsample == "max_pool" else 1
+        super().__init__(in_channels, out_channels, kernel_size, stride=2 // pool, padding=padding)
+        self.pool, self.blocks_in, self.blocks_out = pool, blocks_in, blocks_out
 
     def forward(self, images: Tensor) -> Tensor:
         """Return images ``[N, O, H / 2, W / 2]`` of images ``[N, C, H, W]``, float; both as blocks if so asked."""
         return halve(images, [self])
 
-    def kernel(self) -> Tensor:
-        """Return the convolution's weights as they meet blocks."""
-        places, shape = _rearrangement(tuple(self.weight.shape), self.pool, self.blocks_in, self.blocks_out)
-        return F.pad(self.weight.reshape(-1), (1, 0)).index_select(0, places).view(shape)
+    def on_blocks(self) -> tuple[Tensor, Tensor]:
+        """Return the weights and biases of the convolution that does the same on blocks."""
+        blocks = _blocks(tuple(self.weight.shape), self.pool, self.blocks_in, self.blocks_out)
+        weight = F.pad(self.weight.reshape(-1), (1, 0)).index_select(0, blocks.weights).view(blocks.shape)
+        return weight, self.bias.index_select(0, blocks.biases)
 
 
 def halve(images: Tensor, layers: Sequence[Halving], *, shared: bool = True) -> Tensor:
-    """Return images halved by several layers of the same kind in one convolution: faster, and the same but for rounding.
+    """Return images halved by several layers of a kind in one convolution: faster, and the same but for rounding.
 
     Args:
         images: float ``[N, C, H, W]`` if shared; ``[N, G * C, H, W]`` if not, G the number of layers.
@@ -85,28 +88,36 @@ def halve(images: Tensor, layers: Sequence[Halving], *, shared: bool = True) -> 
     Returns:
         The layers' images one after another, float ``[N, G * O, H / 2, W / 2]``; all as blocks if the layers ask so.
     """
-    kind, count = layers[0], len(layers)
-    groups = 1 if shared else count
-    biases = torch.cat([layer.bias for layer in layers])
-    if not images.is_cpu or kind.blocks_in == kind.blocks_out == 1:
-        weights = torch.cat([layer.weight for layer in layers])
-        halved = F.conv2d(images, weights, biases, kind.stride, kind.padding, groups=groups)
-        return halved if kind.pool == 1 else F.max_pool2d(halved, kind.pool)
-    weights = torch.cat([layer.kernel() for layer in layers])
-    biases = biases.repeat_interleave(kind.blocks_out**2).view(count, 1, -1).expand(-1, kind.pool**2, -1).flatten()
-    stride, padding = 2 * kind.blocks_out // kind.blocks_in, kind.padding[0] // kind.blocks_in
-    halved = F.conv2d(images, weights, biases, stride, padding, groups=groups)
-    return halved if kind.pool == 1 else _largest_of_four(halved, count)
+    kind, groups = layers[0], len(layers)
+    blocks_in, blocks_out = (kind.blocks_in, kind.blocks_out) if images.is_cpu else (1, 1)
+    plain = blocks_in == blocks_out == 1
+    parameters = [(layer.weight, layer.bias) if plain else layer.on_blocks() for layer in layers]
+    weight, bias = (torch.cat(parts) for parts in zip(*parameters, strict=True))
+    stride = kind.stride[0] if plain else 2 * blocks_out // blocks_in
+    padding = kind.kernel_size[0] // 2 // blocks_in
+    halved = F.conv2d(images, weight, bias, stride, padding, groups=1 if shared else groups)
+    if kind.pool == 1:
+        return halved
+    return F.max_pool2d(halved, 2) if plain else _largest_of_four(halved, groups)
+
+
+class _Blocks(NamedTuple):
+    """What the convolution on blocks takes from the plain one.
+
+    Attributes:
+        shape: of its weights. Its outputs are ``pool * blocks_out`` neighbours a side; those that will be pooled are
+            the slowest of its channels.
+        weights: where each of its weights stands in a zero and the plain weights, flat.
+        biases: where each of its biases stands in the plain ones.
+    """
+
+    shape: tuple[int, ...]
+    weights: Tensor
+    biases: Tensor
 
 
 @cache
-def _rearrangement(
-    shape: tuple[int, ...], pool: int, blocks_in: int, blocks_out: int
-) -> tuple[Tensor, tuple[int, ...]]:
-    """Return where each entry of a kernel for blocks stands in the plain weights behind a zero; and that kernel's shape.
-
-    The kernel's outputs are ``pool * blocks_out`` neighbours a side. Those to be pooled are its slowest channels.
-    """
+def _blocks(shape: tuple[int, ...], pool: int, blocks_in: int, blocks_out: int) -> _Blocks:
     step, side = 2 // pool, pool * blocks_out
     size = shape[-1] + step * (side - 1)
     plain = F.pad(torch.arange(1, math.prod(shape) + 1).view(shape), 4 * [step * (side - 1)])
@@ -114,7 +125,8 @@ def _rearrangement(
     kernels = kernels.unflatten(3, (blocks_out, pool)).unflatten(2, (blocks_out, pool))
     kernels = kernels.permute(3, 5, 0, 2, 4, 1, 6, 7).flatten(0, 4)  # [pool**2 * O * blocks_out**2, C, size, size]
     kernels = F.pixel_unshuffle(F.pad(kernels, 2 * [0, -size % blocks_in]), blocks_in)
-    return kernels.flatten(), tuple(kernels.shape)
+    biases = torch.arange(shape[0]).repeat_interleave(blocks_out**2).repeat(pool**2)
+    return _Blocks(tuple(kernels.shape), kernels.flatten(), biases)
 
 
 def _largest_of_four(images: Tensor, groups: int) -> Tensor:

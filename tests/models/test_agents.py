@@ -1,10 +1,16 @@
+from typing import Any
+
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
+from torch.nn import functional as F
 from torchrl.objectives import DQNLoss
 
-from halgan_rl.models.agents import Actor, Critic, Downsample, QNetwork, deterministic_policy, greedy_policy
+from halgan_rl.models import agents
+from halgan_rl.models.agents import Actor, Critic, QNetwork, Vision, deterministic_policy, greedy_policy, see
+from halgan_rl.models.halving import Downsample, Halving, halve
+from halgan_rl.models.pixels import to_float
 
 NETWORKS = {"actor": (Actor, 33_642), "critic": (Critic, 33_673), "ddqn": (QNetwork, 33_708)}
 
@@ -43,17 +49,38 @@ def test_an_untrained_actor_asks_for_the_middle_of_all_actions_unless_told_other
     assert small < 0.01 < 0.1 < large
 
 
-def test_weights_and_activations_are_channels_last() -> None:
-    vision = Actor().vision
+@pytest.mark.parametrize("downsample", ["stride", "max_pool"])
+def test_activations_stay_channels_last(downsample: Downsample, monkeypatch: pytest.MonkeyPatch) -> None:
     layouts = []
-    for layer in vision.layers:
-        if isinstance(layer, nn.Conv2d):
-            assert layer.weight.is_contiguous(memory_format=torch.channels_last)
-            layer.register_forward_hook(
-                lambda _, __, out: layouts.append(out.is_contiguous(memory_format=torch.channels_last))
-            )
-    vision(frames(2))
+
+    def spy(*args: Any, **kwargs: Any) -> Tensor:
+        halved = halve(*args, **kwargs)
+        layouts.append(halved.is_contiguous(memory_format=torch.channels_last))
+        return halved
+
+    monkeypatch.setattr(agents, "halve", spy)
+    see(frames(2), [Vision(downsample) for _ in range(3)])
     assert layouts == [True] * 4
+
+
+@pytest.mark.parametrize("downsample", ["stride", "max_pool"])
+def test_networks_see_together_what_each_sees_and_what_plain_layers_see(downsample: Downsample) -> None:
+    torch.manual_seed(0)
+    visions = [Vision(downsample) for _ in range(3)]
+    pixels = frames(2, 3)
+    pixels[0, :, :32] = 200  # where all is the same, pooled outputs are, too
+    together = see(pixels, visions)
+    for vision, seen in zip(visions, together, strict=True):
+        assert seen.shape == (6, 512)
+        torch.testing.assert_close(vision(pixels), seen)
+        features = to_float(pixels)
+        for layer in vision.layers:
+            if isinstance(layer, Halving):
+                features = F.conv2d(features, layer.weight, layer.bias, layer.stride, layer.padding)
+                features = F.max_pool2d(features, 2) if downsample == "max_pool" else features
+            else:
+                features = layer(features)
+        torch.testing.assert_close(seen, features)
 
 
 def test_actions_stay_in_range_and_depend_on_the_image() -> None:
