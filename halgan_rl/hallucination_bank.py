@@ -102,6 +102,8 @@ class BankGrid:
     def cells_at(self, relative: Tensor, goal_offset: float | Tensor) -> tuple[Tensor, Tensor]:
         """Return the cells nearest to relative goal poses ``[..., 3]``, int64 ``[...]``, and which are in sight.
 
+        The cell of what is out of sight means nothing.
+
         Args:
             relative: ``[..., 3]``.
             goal_offset: of each goal [m], broadcasts against ``[...]``.
@@ -110,12 +112,12 @@ class BankGrid:
         x, y = x + goal_offset * yaw.cos(), y + goal_offset * yaw.sin()
         bearing, inverse = torch.atan2(y, x), 1 / torch.hypot(x, y).clamp(self.nearest, self.farthest)
         steps = (self.distances - 1) / (1 / self.nearest - 1 / self.farthest)
-        row = ((1 / self.nearest - inverse) * steps).round()
-        column = ((bearing + self.widest) * ((self.bearings - 1) / (2 * self.widest))).round()
-        turn = (yaw * (self.yaws / (2 * pi))).round() % self.yaws
-        in_sight = bearing.abs() <= self.widest
-        cell = (row * self.bearings + column.clamp(0, self.bearings - 1)) * self.yaws + turn
-        return cell.to(torch.int64), in_sight
+        row = ((1 / self.nearest - inverse) * steps).round_()
+        column = ((bearing + self.widest) * ((self.bearings - 1) / (2 * self.widest))).round_()
+        cell = (row * self.bearings + column).to(torch.int64)
+        if self.yaws > 1:
+            cell = cell * self.yaws + (yaw * (self.yaws / (2 * pi))).round_().to(torch.int64) % self.yaws
+        return cell, bearing.abs() <= self.widest
 
 
 class HallucinationBank:
@@ -176,26 +178,22 @@ class HallucinationBank:
     @property
     def nbytes(self) -> int:
         """Size of the table [bytes]."""
-        return sum(part.nbytes for part in (self._starts, self._lines, self._kept, self._added))
+        return sum(part.nbytes for part in (self._spans, self._lines, self._mattes))
 
     @torch.no_grad()
     def __call__(self, pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
         """Paint the goals, see :class:`~halgan_rl.hallucinators.Hallucinator`."""
         check_poses(self._pose_size, pose=pose, goal_pose=goal_pose)
         cells = self._cells_at(pose, goal_pose).flatten()
-        starts = self._starts.index_select(0, cells)
-        counts = self._starts.index_select(0, cells + 1) - starts
+        starts, counts = self._spans.index_select(0, cells).unbind(1)
         images = torch.repeat_interleave(counts)
-        entries = torch.arange(len(images)) + (starts - counts.cumsum(0) + counts).index_select(0, images)
+        entries = torch.arange(len(images)) + (starts + counts - counts.cumsum(0)).index_select(0, images)
         height, width = pixels.shape[-3:-1]
-        places = images * height + self._lines.index_select(0, entries)
+        places = self._lines.index_select(0, entries) + images * height
         lines = pixels.reshape(-1, width, 3)
-        before, kept, added = (
-            part.index_select(0, where).to(torch.int16)
-            for part, where in ((lines, places), (self._kept, entries), (self._added, entries))
-        )
-        after = before.mul_(kept).add_(WHOLE // 2).bitwise_right_shift_(SHIFT).add_(added).clamp_(max=255)
-        return replace_rows(lines, places, after.to(torch.uint8)).view(pixels.shape)
+        kept, added = self._mattes.index_select(0, entries).to(torch.int16).unbind(1)
+        after = lines.index_select(0, places).to(torch.int16).mul_(kept).add_(WHOLE // 2).bitwise_right_shift_(SHIFT)
+        return replace_rows(lines, places, after.add_(added).clamp_(max=255).to(torch.uint8)).view(pixels.shape)
 
     def _cells_at(self, pose: Tensor, goal_pose: Tensor) -> Tensor:
         """Return the rows of the table ``[N, F]`` for poses ``[N, F, P]`` and goals ``[N, 1, P]``."""
@@ -209,18 +207,17 @@ class HallucinationBank:
     def _tabulate(self, generator: HallucinationGenerator, chunk: int) -> None:
         """Ask the generator for every cell, and keep what is to be seen of its answers."""
         features = generator.encoding(generator.encoding.labels(*self._poses()))
-        counts, lines, kept, added = [], [], [], []
+        counts, lines, mattes = [], [], []
         for latent in generator.sample_latent(self._grid.latents, self._rng):
             for block in features.split(BLOCK):
                 keep, add = _ask(generator, block, latent, chunk)
                 visible = torch.maximum(255 - keep.to(torch.int16) * 255 // WHOLE, add).amax((2, 3)) > VISIBLE
                 counts.append(visible.sum(1))
                 lines.append(visible.nonzero()[:, 1])
-                kept.append(keep[visible])
-                added.append(add[visible])
-        none = torch.zeros(1, dtype=torch.int64)
-        self._starts = torch.cat([none, *counts, none]).cumsum(0)  # the last cell, out of sight, is empty
-        self._lines, self._kept, self._added = torch.cat(lines), torch.cat(kept), torch.cat(added)
+                mattes.append(torch.stack([keep[visible], add[visible]], 1))
+        spans = torch.cat([*counts, torch.zeros(1, dtype=torch.int64)])  # the last cell, out of sight, is empty
+        self._spans = torch.stack([spans.cumsum(0) - spans, spans], 1)
+        self._lines, self._mattes = torch.cat(lines), torch.cat(mattes)
 
     def _poses(self) -> tuple[Tensor, Tensor]:
         """Return poses at the origin, with all settings of the flags, and the goal poses to see from there."""

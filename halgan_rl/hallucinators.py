@@ -1,5 +1,6 @@
 """Hallucinators: whatever paints a goal into images."""
 
+import math
 from typing import Protocol
 
 import torch
@@ -96,5 +97,5 @@ def check_poses(size: int, **poses: Tensor) -> None:
                 f"{name} has {value.shape[-1]} entries, but the generator was trained with {size}: "
                 "use weights of an environment with such poses"
             )
-        if not value.isfinite().all():
+        if not math.isfinite(value.sum()):  # several times as fast as looking at each entry
             raise ValueError(f"{name} holds NaN or infinity: look for it in the rows of the replay buffer")
