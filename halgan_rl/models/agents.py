@@ -24,7 +24,7 @@ class Vision(nn.Module):
 
     Args:
         downsample: how each convolution halves: ``"stride"`` 2, or ``"max_pool"`` behind it. The paper's table does not
-            tell; the parameters are the same, the strides cost about a third of the time.
+            tell; the parameters are the same, the strides cost less than half of the time.
 
     Raises:
         ValueError: if ``downsample`` is neither.

@@ -89,7 +89,8 @@ def halve(images: Tensor, layers: Sequence[Halving], *, shared: bool = True) -> 
         The layers' images one after another, float ``[N, G * O, H / 2, W / 2]``; all as blocks if the layers ask so.
     """
     kind, groups = layers[0], len(layers)
-    blocks_in, blocks_out = (kind.blocks_in, kind.blocks_out) if images.is_cpu else (1, 1)
+    few_lanes = images.is_cpu and not torch.compiler.is_compiling()  # a compiler lays channels out by itself
+    blocks_in, blocks_out = (kind.blocks_in, kind.blocks_out) if few_lanes else (1, 1)
     plain = blocks_in == blocks_out == 1
     parameters = [(layer.weight, layer.bias) if plain else layer.on_blocks() for layer in layers]
     weight, bias = (torch.cat(parts) for parts in zip(*parameters, strict=True))
