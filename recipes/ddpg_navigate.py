@@ -26,7 +26,7 @@ Metrics, one row an evaluation:
 Differences from the paper (Sahni et al., NeurIPS 2019, appendix), all undone by ``--preset paper``:
 
 1. A 2 m room and starts at least 0.5 m from the box instead of 4 m and 1 m.
-2. Strided convolutions instead of max-pooling (as many parameters; the paper tells of neither): less than half the time.
+2. Strided convolutions instead of max-pooling (as many parameters; the paper tells neither): less than half the time.
 3. Learning rates 1e-4 and 1e-3 instead of 1e-5 and 1e-4.
 4. Discount 0.95 instead of 0.99: one step then changes a value by 5 % and not by 1 %, which is more than the critic's
    error, and values that it makes up decay. Target rate 2e-2 instead of 1e-3: values spread that much faster.
