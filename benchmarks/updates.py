@@ -8,9 +8,9 @@ Ours is the recipe's update: sampling from a ``FrameStorage``, TorchRL's loss wi
 price on the actor's pre-activations) and shared passes through the convolutions, one fused Adam. Stable-Baselines3's is
 ``DDPG.train`` or ``DQN.train`` with plain convolutions as features extractor, in DDPG one for each of actor and critic
 (it has one learning rate for both). TorchRL's is ``DDPGLoss`` or ``DQNLoss``, an Adam for each network and
-``SoftUpdate`` on a ``LazyTensorStorage`` of images channels first. Both peers' networks are plain layers in PyTorch's
-default memory format that compute the same function; the numbers of parameters are compared before measuring. One
-thread, medians of processor time in alternating rounds.
+``SoftUpdate`` on a ``LazyTensorStorage`` of images channels first. The peers' networks are plain layers that compute the
+same, in PyTorch's default memory format; TorchRL's in ``channels_last`` as well. The numbers of parameters are compared
+before measuring. One thread, medians of processor time in alternating rounds.
 
 Stable-Baselines3's DQN is not double: it does not ask the online network about next frames, one forward pass less. So
 ours is measured without that pass as well, and compared with that. Its ``train`` leaves the target network to the steps
@@ -107,9 +107,9 @@ def make_single_dqn(config: ddqn.DDQNConfig, actions: TensorSpec) -> Agent:
     return agent
 
 
-def contiguous(network: nn.Module, config: HindsightConfig) -> nn.Module:
+def with_plain_vision(network: nn.Module, config: HindsightConfig, memory_format: torch.memory_format) -> nn.Module:
     """Return one of our networks, changed to images channels first and plain convolutions."""
-    network.vision = PlainVision(config.downsample)
+    network.vision = PlainVision(config.downsample, memory_format)
     return network
 
 
@@ -117,9 +117,9 @@ LearningRates = list[tuple[TensorDict, float]]
 """Parameters, and the learning rate of their Adam."""
 
 
-def torchrl_ddpg(config: ddpg.DDPGConfig) -> tuple[LossModule, LearningRates]:
+def torchrl_ddpg(config: ddpg.DDPGConfig, memory_format: torch.memory_format) -> tuple[LossModule, LearningRates]:
     """Return TorchRL's loss on our actor and critic, channels first."""
-    actor, critic = contiguous(Actor(), config), contiguous(Critic(), config)
+    actor, critic = (with_plain_vision(network, config, memory_format) for network in (Actor(), Critic()))
     loss = DDPGLoss(
         TensorDictModule(nn.Sequential(actor, nn.Tanh()), in_keys=["pixels"], out_keys=["action"]),
         TensorDictModule(critic, in_keys=["pixels", "action"], out_keys=["state_action_value"]),
@@ -130,20 +130,23 @@ def torchrl_ddpg(config: ddpg.DDPGConfig) -> tuple[LossModule, LearningRates]:
     return loss, list(zip((loss.actor_network_params, loss.value_network_params), rates, strict=True))
 
 
-def torchrl_ddqn(config: ddqn.DDQNConfig) -> tuple[LossModule, LearningRates]:
+def torchrl_ddqn(config: ddqn.DDQNConfig, memory_format: torch.memory_format) -> tuple[LossModule, LearningRates]:
     """Return TorchRL's loss on our network of action values, channels first."""
-    values = greedy_policy(contiguous(QNetwork(), config))
+    values = greedy_policy(with_plain_vision(QNetwork(), config, memory_format))
     loss = DQNLoss(values, delay_value=True, double_dqn=True, action_space="one_hot")
     return loss, [(loss.value_network_params, config.learning_rate)]
 
 
 def torchrl_loop(
-    make_loss: Callable[[Any], tuple[LossModule, LearningRates]], config: HindsightConfig, rows: TensorDict
+    make_loss: Callable[[Any, torch.memory_format], tuple[LossModule, LearningRates]],
+    memory_format: torch.memory_format,
+    config: HindsightConfig,
+    rows: TensorDict,
 ) -> tuple[Update, Counts]:
     """Return TorchRL's plain update, and the numbers of parameters."""
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(len(rows)), batch_size=config.batch_size)
     buffer.extend(plain(rows).update({"pixels": channels_first(rows["pixels"])}).update(_next_channels_first(rows)))
-    loss, rates = make_loss(config)
+    loss, rates = make_loss(config, memory_format)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=config.discount)
     optimizers = [torch.optim.Adam(parameters.values(True, True), lr=rate) for parameters, rate in rates]
     target_updater = SoftUpdate(loss, tau=config.target_rate)
@@ -206,7 +209,8 @@ ALGORITHMS = {
         {
             "ours": partial(ours, ddpg.make_agent, DRIVE),
             "SB3 DDPG.train": sb3_ddpg,
-            "torchrl plain loop": partial(torchrl_loop, torchrl_ddpg),
+            "torchrl plain loop": partial(torchrl_loop, torchrl_ddpg, torch.contiguous_format),
+            "torchrl plain loop, channels_last": partial(torchrl_loop, torchrl_ddpg, torch.channels_last),
         },
         passes=((2, True), (2, False)),  # actor and critic at s, their targets at s'
     ),
@@ -217,7 +221,8 @@ ALGORITHMS = {
             "ours": partial(ours, ddqn.make_agent, CHOICE),
             "ours, not double": partial(ours, make_single_dqn, CHOICE),
             "SB3 DQN.train, not double": sb3_dqn,
-            "torchrl plain loop": partial(torchrl_loop, torchrl_ddqn),
+            "torchrl plain loop": partial(torchrl_loop, torchrl_ddqn, torch.contiguous_format),
+            "torchrl plain loop, channels_last": partial(torchrl_loop, torchrl_ddqn, torch.channels_last),
         },
         passes=((1, True), (2, False)),  # the network at s; with its target at s'
     ),

@@ -97,5 +97,5 @@ def check_poses(size: int, **poses: Tensor) -> None:
                 f"{name} has {value.shape[-1]} entries, but the generator was trained with {size}: "
                 "use weights of an environment with such poses"
             )
-        if not math.isfinite(value.sum()):  # several times as fast as looking at each entry
+        if not math.isfinite(value.sum(dtype=torch.float64)):  # several times as fast as looking at each entry
             raise ValueError(f"{name} holds NaN or infinity: look for it in the rows of the replay buffer")

@@ -1,26 +1,26 @@
 """Target networks that follow, all their parameters in one call."""
 
-from typing import Any
-
+import torch
+from torch import Tensor
 from torch.optim.swa_utils import get_ema_multi_avg_fn
-from torchrl.objectives import LossModule, SoftUpdate
+from torchrl.objectives import SoftUpdate
 
 
 class FusedSoftUpdate(SoftUpdate):
-    """TorchRL's SoftUpdate, which gathers the parameters anew at each step, with parameters gathered once.
+    """TorchRL's SoftUpdate, but that the parameters are not gathered anew at each step; arguments as there."""
 
-    Args:
-        loss_module: already where it will stay.
-        **kwargs: see :class:`~torchrl.objectives.SoftUpdate`.
-    """
-
-    def __init__(self, loss_module: LossModule, **kwargs: Any) -> None:
-        super().__init__(loss_module, **kwargs)
-        keys = list(self._sources.keys(True, True))
-        self._from = [self._sources[key].detach() for key in keys]
-        self._to = [self._targets[f"target_{key[0]}", *key[1:]] for key in keys]
-        self._average = get_ema_multi_avg_fn(self.eps)
-
+    @torch.no_grad()
     def step(self) -> None:
         """Move each target parameter by a fraction tau towards its source."""
-        self._average(self._to, self._from, None)
+        loss = self.loss_module
+        pairs = loss.__dict__.get("_cached_pairs")  # erased by TorchRL, as all that begins so, when parameters move
+        if pairs is None:
+            pairs = loss.__dict__["_cached_pairs"] = self._gather()
+        get_ema_multi_avg_fn(self.eps)(*pairs, None)
+
+    def _gather(self) -> tuple[list[Tensor], list[Tensor]]:
+        """Return the target parameters and what they follow."""
+        children = dict(self.loss_module.named_children())
+        keys = [(name, *path) for name, *path in self._sources.keys(True, True)]
+        targets = [children[f"target_{name}"][tuple(path)] for name, *path in keys]
+        return targets, [children[name][tuple(path)] for name, *path in keys]

@@ -113,6 +113,9 @@ def test_poses_of_another_size_or_not_finite_are_refused(
     pixels, pose, goal_pose = rows
     with pytest.raises(ValueError, match="4 entries, but the generator was trained with 3"):
         hallucinator(generator)(pixels, torch.zeros(ROWS, FRAMES, 4), goal_pose)
-    goal_pose[1, 0, 2] = float("nan")
-    with pytest.raises(ValueError, match="goal_pose holds NaN"):
-        hallucinator(generator)(pixels, pose, goal_pose)
+    for strange in (float("nan"), float("inf"), -float("inf")):
+        goal_pose[1, 0, 2] = strange
+        with pytest.raises(ValueError, match="goal_pose holds NaN or infinity"):
+            hallucinator(generator)(pixels, pose, goal_pose)
+    goal_pose[:] = 3e38  # far, but finite
+    hallucinator(generator)(pixels, pose, goal_pose)

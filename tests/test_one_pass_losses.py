@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import pickle
 from collections.abc import Callable
 from typing import Any
 
@@ -131,16 +132,106 @@ def learn(loss: LossModule, updater: SoftUpdate, rows: TensorDict) -> torch.Tens
 
 def test_targets_follow_the_parameters(pair: Pair) -> None:
     rows = pair.rows.clone()
-    ours = learn(pair.ours, FusedSoftUpdate(pair.ours, tau=0.5), rows)
+    ours = learn(pair.ours, FusedSoftUpdate(pair.ours, tau=0.1), rows)
     assert ours.diff().abs().min() > 1e-3
-    torch.testing.assert_close(ours, learn(pair.theirs, SoftUpdate(pair.theirs, tau=0.5), rows), rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(ours, learn(pair.theirs, SoftUpdate(pair.theirs, tau=0.1), rows), rtol=1e-3, atol=1e-4)
+
+
+def targets(loss: Any) -> tuple[torch.nn.Module, ...]:
+    """Return the target networks, of DDPG actor and critic."""
+    target = loss._cached_networks[1]
+    return target if isinstance(target, tuple) else (target,)
 
 
 def test_targets_move_with_the_loss(pair: Pair) -> None:
     moved = pair.ours.double()
     parameters = {parameter for name, parameter in moved.state_dict().items() if name.startswith("target_")}
-    held = [tensor for network in moved._cached_targets for tensor in network.state_dict().values()]
+    held = [tensor for network in targets(moved) for tensor in network.state_dict().values()]
     assert {tensor.data_ptr() for tensor in held} == {tensor.data_ptr() for tensor in parameters}
+
+
+MOVES: dict[str, Callable[[LossModule], LossModule]] = {
+    "to a memory format": lambda loss: loss.to(memory_format=torch.contiguous_format),
+    "all anew": lambda loss: loss._apply(torch.clone),
+    "to another type": lambda loss: loss.double().float(),
+}
+
+
+@pytest.mark.parametrize("move", MOVES.values(), ids=MOVES)
+def test_the_update_of_targets_follows_where_they_move(pair: Pair, move: Callable[[LossModule], LossModule]) -> None:
+    updater = FusedSoftUpdate(pair.ours, tau=0.1)
+    updater.step()
+    move(pair.ours)
+    state = pair.ours.state_dict()
+    sources = {name: value for name, value in state.items() if f"target_{name}" in state}
+    before = {name: pair.ours.state_dict()[f"target_{name}"].clone() for name in sources}
+    for value in sources.values():
+        value.add_(1.0)
+    updater.step()
+    updater.eps = 1.0
+    updater.step()
+    for name, value in sources.items():
+        torch.testing.assert_close(pair.ours.state_dict()[f"target_{name}"], before[name].lerp(value, 0.1))
+
+
+COPIES: dict[str, Callable[[LossModule], LossModule]] = {
+    "deepcopy": copy.deepcopy,
+    "pickle": lambda loss: pickle.loads(pickle.dumps(loss)),
+}
+
+
+@pytest.mark.parametrize("duplicate", COPIES.values(), ids=COPIES)
+def test_a_copy_has_networks_of_its_own(pair: Pair, duplicate: Callable[[LossModule], LossModule]) -> None:
+    before = pair.ours(pair.rows.clone())
+    copied = duplicate(pair.ours)
+    for tensor in copied.state_dict().values():
+        tensor.add_(0.05 * torch.randn_like(tensor))
+    pair.theirs.load_state_dict(copied.state_dict())
+    for name, value in pair.theirs(pair.rows.clone()).items():
+        torch.testing.assert_close(copied(pair.rows.clone())[name], value, rtol=1e-3, atol=1e-4, msg=name)
+    for name, value in pair.ours(pair.rows.clone()).items():
+        torch.testing.assert_close(before[name], value, msg=name)
+    sum(value.sum() for name, value in copied(pair.rows).items() if name.startswith("loss")).backward()
+    assert all(parameter.grad is not None for parameter in copied.parameters() if parameter.requires_grad)
+    assert all(parameter.grad is None for parameter in pair.ours.parameters())
+
+
+def test_rows_without_batch_dimensions_of_their_own_do_the_same(pair: Pair) -> None:
+    if pair.ours.reduction == "none":
+        pytest.skip("rows are not averaged")
+    loose = TensorDict(pair.rows.to_dict(), batch_size=[])
+    for name, value in pair.theirs(loose.clone()).items():
+        torch.testing.assert_close(pair.ours(loose)[name], value, rtol=1e-4, atol=1e-5, msg=name)
+
+
+def test_rows_that_are_masked_do_not_count(pair: Pair) -> None:
+    rows = pair.rows.clone().set(("collector", "mask"), torch.rand(pair.rows.shape) < 0.5)
+    for name, value in pair.theirs(rows.clone()).items():
+        torch.testing.assert_close(pair.ours(rows)[name], value, rtol=1e-4, atol=1e-5, msg=name)
+
+
+def test_one_loss_alone_leaves_zeros_where_torchrl_leaves_nothing() -> None:
+    torch.manual_seed(0)
+    pair = ddpg()
+    pair.ours.make_value_estimator(gamma=0.9)
+    FusedSoftUpdate(pair.ours, tau=0.1)
+    pair.ours(pair.rows)["loss_value"].backward()
+    gradients = [value.grad for value in pair.ours.actor_network_params.values(True, True)]
+    assert sum(gradient is not None for gradient in gradients) == 8
+    assert not any(gradient.any() for gradient in gradients if gradient is not None)
+
+
+def test_separate_losses_are_refused() -> None:
+    with pytest.raises(ValueError, match="separate_losses=True"):
+        OnePassDDPGLoss(Actor(), Critic(), separate_losses=True)
+
+
+def test_networks_of_different_kinds_are_refused() -> None:
+    loss = OnePassDDPGLoss(Actor(downsample="max_pool"), Critic())
+    loss.make_value_estimator(gamma=0.9)
+    FusedSoftUpdate(loss, tau=0.1)
+    with pytest.raises(ValueError, match=r"one down-sampling, got \['max_pool', 'stride'\]"):
+        loss(ddpg().rows)
 
 
 def test_targets_are_clipped() -> None:

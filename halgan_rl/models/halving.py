@@ -7,7 +7,6 @@ kernel holds the same weights, shifted for each neighbour, and zeros between the
 
 import math
 from collections.abc import Sequence
-from functools import cache
 from typing import Literal, NamedTuple
 
 import torch
@@ -65,6 +64,8 @@ class Halving(nn.Conv2d):
         pool = 2 if downsample == "max_pool" else 1
         super().__init__(in_channels, out_channels, kernel_size, stride=2 // pool, padding=padding)
         self.pool, self.blocks_in, self.blocks_out = pool, blocks_in, blocks_out
+        with torch.inference_mode(False), torch.device("cpu"):
+            self._blocks = _make_blocks(tuple(self.weight.shape), pool, blocks_in, blocks_out)
 
     def forward(self, images: Tensor) -> Tensor:
         """Return images ``[N, O, H / 2, W / 2]`` of images ``[N, C, H, W]``, float; both as blocks if so asked."""
@@ -72,13 +73,12 @@ class Halving(nn.Conv2d):
 
     def on_blocks(self) -> tuple[Tensor, Tensor]:
         """Return the weights and biases of the convolution that does the same on blocks."""
-        blocks = _blocks(tuple(self.weight.shape), self.pool, self.blocks_in, self.blocks_out)
-        weight = F.pad(self.weight.reshape(-1), (1, 0)).index_select(0, blocks.weights).view(blocks.shape)
-        return weight, self.bias.index_select(0, blocks.biases)
+        weight = F.pad(self.weight.reshape(-1), (1, 0)).index_select(0, self._blocks.weights).view(self._blocks.shape)
+        return weight, self.bias.index_select(0, self._blocks.biases)
 
 
 def halve(images: Tensor, layers: Sequence[Halving], *, shared: bool = True) -> Tensor:
-    """Return images halved by several layers of a kind in one convolution: faster, and the same but for rounding.
+    """Return images halved by several layers of a kind in one convolution, the same as by each but for rounding.
 
     Args:
         images: float ``[N, C, H, W]`` if shared; ``[N, G * C, H, W]`` if not, G the number of layers.
@@ -89,8 +89,7 @@ def halve(images: Tensor, layers: Sequence[Halving], *, shared: bool = True) -> 
         The layers' images one after another, float ``[N, G * O, H / 2, W / 2]``; all as blocks if the layers ask so.
     """
     kind, groups = layers[0], len(layers)
-    few_lanes = images.is_cpu and not torch.compiler.is_compiling()  # a compiler lays channels out by itself
-    blocks_in, blocks_out = (kind.blocks_in, kind.blocks_out) if few_lanes else (1, 1)
+    blocks_in, blocks_out = (kind.blocks_in, kind.blocks_out) if images.is_cpu else (1, 1)
     plain = blocks_in == blocks_out == 1
     parameters = [(layer.weight, layer.bias) if plain else layer.on_blocks() for layer in layers]
     weight, bias = (torch.cat(parts) for parts in zip(*parameters, strict=True))
@@ -117,8 +116,7 @@ class _Blocks(NamedTuple):
     biases: Tensor
 
 
-@cache
-def _blocks(shape: tuple[int, ...], pool: int, blocks_in: int, blocks_out: int) -> _Blocks:
+def _make_blocks(shape: tuple[int, ...], pool: int, blocks_in: int, blocks_out: int) -> _Blocks:
     step, side = 2 // pool, pool * blocks_out
     size = shape[-1] + step * (side - 1)
     plain = F.pad(torch.arange(1, math.prod(shape) + 1).view(shape), 4 * [step * (side - 1)])

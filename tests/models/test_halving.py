@@ -1,6 +1,7 @@
 """Convolutions on blocks compute what plain ones do."""
 
 import itertools
+from typing import Any
 
 import pytest
 import torch
@@ -82,3 +83,15 @@ def test_off_the_cpu_images_come_as_they_are(downsample: Downsample) -> None:
 def test_blocks_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ValueError, match=r"blocks_in=4 must divide the padding, 2, and 2 \* blocks_out, 4"):
         Halving(3, 4, 5, blocks_in=4, blocks_out=2)
+
+
+@pytest.mark.parametrize("mode", [torch.inference_mode(), torch.device("meta")], ids=["inference", "meta"])
+def test_where_a_layer_is_made_does_not_matter(mode: Any) -> None:
+    with mode:
+        made = Halving(3, 4, 5, blocks_out=2)
+    layer = make_layer("stride", 1, 2)
+    layer._blocks = made._blocks
+    images = make_images(3)
+    halved = layer(images)
+    torch.testing.assert_close(F.pixel_shuffle(halved, 2), plain(images, layer))
+    halved.sum().backward()
