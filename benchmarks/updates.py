@@ -8,8 +8,8 @@ Ours is the recipe's update: sampling from a ``FrameStorage``, TorchRL's loss wi
 price on the actor's pre-activations) and shared passes through the convolutions, one fused Adam. Stable-Baselines3's is
 ``DDPG.train`` or ``DQN.train`` with plain convolutions as features extractor, in DDPG one for each of actor and critic
 (it has one learning rate for both). TorchRL's is ``DDPGLoss`` or ``DQNLoss``, an Adam for each network and
-``SoftUpdate`` on a ``LazyTensorStorage`` of images channels first. The peers' networks are plain layers that compute the
-same, in PyTorch's default memory format; TorchRL's in ``channels_last`` as well. The numbers of parameters are compared
+``SoftUpdate`` on a ``LazyTensorStorage`` of images channels first. Peers have networks of plain layers that compute
+the same, in PyTorch's default memory format; TorchRL's in ``channels_last`` as well. The numbers of parameters are compared
 before measuring. One thread, medians of processor time in alternating rounds.
 
 Stable-Baselines3's DQN is not double: it does not ask the online network about next frames, one forward pass less. So
