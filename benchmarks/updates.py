@@ -9,8 +9,8 @@ price on the actor's pre-activations) and shared passes through the convolutions
 ``DDPG.train`` or ``DQN.train`` with plain convolutions as features extractor, in DDPG one for each of actor and critic
 (it has one learning rate for both). TorchRL's is ``DDPGLoss`` or ``DQNLoss``, an Adam for each network and
 ``SoftUpdate`` on a ``LazyTensorStorage`` of images channels first. Peers have networks of plain layers that compute
-the same, in PyTorch's default memory format; TorchRL's in ``channels_last`` as well. The numbers of parameters are compared
-before measuring. One thread, medians of processor time in alternating rounds.
+the same, in PyTorch's default memory format; TorchRL's in ``channels_last`` as well. The numbers of parameters are
+compared before measuring. One thread, medians of processor time in alternating rounds.
 
 Stable-Baselines3's DQN is not double: it does not ask the online network about next frames, one forward pass less. So
 ours is measured without that pass as well, and compared with that. Its ``train`` leaves the target network to the steps
@@ -78,7 +78,7 @@ def ours(
     buffer = make_buffer(config, None)
     buffer.extend(plain(rows))
     agent = make_agent(config, actions)
-    return lambda: agent.update(buffer.sample()), count_parameters(agent.loss)
+    return lambda: agent.update(buffer.sample(config.batch_size)), count_parameters(agent.loss)
 
 
 Passes = Sequence[tuple[int, bool]]

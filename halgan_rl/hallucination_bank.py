@@ -8,8 +8,7 @@ from torch import Tensor
 
 from halgan_rl.hallucinators import check_poses
 from halgan_rl.models.halgan import HallucinationGenerator
-from halgan_rl.poses import flag_number, relative_pose
-from halgan_rl.rows import replace_rows
+from halgan_rl.poses import flag_number, wrap_angle
 
 VISIBLE = 2
 """A line of the image is stored if it changes a black or a white image by more than this [levels of 255]."""
@@ -99,24 +98,27 @@ class BankGrid:
         y = bearing.sin() / inverse - goal_offset * yaw.sin()
         return torch.stack([x, y, yaw], -1)
 
-    def cells_at(self, relative: Tensor, goal_offset: float | Tensor) -> tuple[Tensor, Tensor]:
-        """Return the cells nearest to relative goal poses ``[..., 3]``, int64 ``[...]``, and which are in sight.
+    def cells_at(self, pose: Tensor, goal_pose: Tensor, goal_offset: float | Tensor) -> tuple[Tensor, Tensor]:
+        """Return the cells nearest to goals as seen from poses, int64 ``[...]``, and which are in sight.
 
         The cell of what is out of sight means nothing.
 
         Args:
-            relative: ``[..., 3]``.
+            pose: ``[..., P]``.
+            goal_pose: ``[..., P]``, broadcasts against ``pose``.
             goal_offset: of each goal [m], broadcasts against ``[...]``.
         """
-        x, y, yaw = relative.unbind(-1)
-        x, y = x + goal_offset * yaw.cos(), y + goal_offset * yaw.sin()
-        bearing, inverse = torch.atan2(y, x), 1 / torch.hypot(x, y).clamp(self.nearest, self.farthest)
+        x, y, yaw = pose[..., :3].unbind(-1)
+        goal_x, goal_y, goal_yaw = goal_pose[..., :3].unbind(-1)
+        x, y = goal_x + goal_offset * goal_yaw.cos() - x, goal_y + goal_offset * goal_yaw.sin() - y
+        bearing = wrap_angle(torch.atan2(y, x) - yaw)
+        inverse = 1 / torch.hypot(x, y).clamp_(self.nearest, self.farthest)
         steps = (self.distances - 1) / (1 / self.nearest - 1 / self.farthest)
         row = ((1 / self.nearest - inverse) * steps).round_()
         column = ((bearing + self.widest) * ((self.bearings - 1) / (2 * self.widest))).round_()
         cell = (row * self.bearings + column).to(torch.int64)
         if self.yaws > 1:
-            cell = cell * self.yaws + (yaw * (self.yaws / (2 * pi))).round_().to(torch.int64) % self.yaws
+            cell = cell * self.yaws + ((goal_yaw - yaw) * (self.yaws / (2 * pi))).round_().to(torch.int64) % self.yaws
         return cell, bearing.abs() <= self.widest
 
 
@@ -190,15 +192,18 @@ class HallucinationBank:
         entries = torch.arange(len(images)) + (starts + counts - counts.cumsum(0)).index_select(0, images)
         height, width = pixels.shape[-3:-1]
         places = self._lines.index_select(0, entries) + images * height
-        lines = pixels.reshape(-1, width, 3)
+        lines = pixels.clone(memory_format=torch.contiguous_format).view(-1, width, 3)
         kept, added = self._mattes.index_select(0, entries).to(torch.int16).unbind(1)
         after = lines.index_select(0, places).to(torch.int16).mul_(kept).add_(WHOLE // 2).bitwise_right_shift_(SHIFT)
-        return replace_rows(lines, places, after.add_(added).clamp_(max=255).to(torch.uint8)).view(pixels.shape)
+        after = after.add_(added).clamp_(max=255).to(torch.uint8)
+        words, new_words = (part.flatten(1).view(torch.int64) for part in (lines, after))  # eight bytes at once
+        words.index_copy_(0, places, new_words)
+        return lines.view(pixels.shape)
 
     def _cells_at(self, pose: Tensor, goal_pose: Tensor) -> Tensor:
         """Return the rows of the table ``[N, F]`` for poses ``[N, F, P]`` and goals ``[N, 1, P]``."""
         setting = flag_number(pose) if self._settings > 1 else 0
-        cell, in_sight = self._grid.cells_at(relative_pose(pose, goal_pose), self._offsets[setting])
+        cell, in_sight = self._grid.cells_at(pose, goal_pose, self._offsets[setting])
         latents_a_row = 1 if self._share_latent else pose.shape[1]
         latent = torch.randint(self._grid.latents, (len(pose), latents_a_row), generator=self._rng)
         return torch.where(in_sight, (latent * self._settings + setting) * self._grid.cells + cell, self.cells)

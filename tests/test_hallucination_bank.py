@@ -36,10 +36,21 @@ def random_frames(*shape: int) -> Tensor:
 @pytest.mark.parametrize("yaws", [1, 4])
 def test_each_cell_is_nearest_to_its_own_centre(goal_offset: float, yaws: int) -> None:
     grid = BankGrid(goal_offset=goal_offset, distances=9, bearings=11, yaws=yaws, widest=0.9)
-    cells, in_sight = grid.cells_at(grid.relative_poses(goal_offset), goal_offset)
+    cells, in_sight = grid.cells_at(torch.zeros(3), grid.relative_poses(goal_offset), goal_offset)
     assert cells.tolist() == list(range(grid.cells)) == list(range(9 * 11 * yaws))
     inner = torch.arange(grid.cells).reshape(9, 11, yaws)[:, 1:-1].flatten()  # the outermost bearings may round away
     assert in_sight[inner].all()
+
+
+def test_a_cell_depends_on_the_relative_pose_only() -> None:
+    grid = BankGrid(goal_offset=0.2, distances=9, bearings=11, yaws=4, widest=0.9)
+    relative = grid.relative_poses(0.2)
+    yaw = torch.linspace(-9.0, 9.0, len(relative))
+    pose = torch.stack([yaw.cos(), 2 * yaw.sin(), yaw], -1)
+    x, y, turn = relative.unbind(-1)
+    ahead, left = torch.stack([yaw.cos(), yaw.sin()], -1), torch.stack([-yaw.sin(), yaw.cos()], -1)
+    goal = torch.cat([pose[:, :2] + x[:, None] * ahead + y[:, None] * left, (yaw + turn)[:, None]], -1)
+    assert grid.cells_at(pose, goal, 0.2)[0].tolist() == list(range(grid.cells))
 
 
 def test_cells_are_spaced_by_bearing_and_inverse_distance_of_the_goal_itself() -> None:
@@ -54,8 +65,9 @@ def test_cells_are_spaced_by_bearing_and_inverse_distance_of_the_goal_itself() -
 
 def test_what_is_nearer_or_farther_than_the_grid_is_painted_at_its_edge() -> None:
     grid = BankGrid(goal_offset=0.0, distances=4, bearings=5)
-    near, far = grid.cells_at(torch.tensor([[1e-4, 0.0, 0.0], [99.0, 0.0, 0.0]]), 0.0)[0]
-    edges = grid.cells_at(torch.tensor([[grid.nearest, 0.0, 0.0], [grid.farthest, 0.0, 0.0]]), 0.0)[0]
+    near, far = grid.cells_at(torch.zeros(3), torch.tensor([[1e-4, 0.0, 0.0], [99.0, 0.0, 0.0]]), 0.0)[0]
+    ends = torch.tensor([[grid.nearest, 0.0, 0.0], [grid.farthest, 0.0, 0.0]])
+    edges = grid.cells_at(torch.zeros(3), ends, 0.0)[0]
     assert [near, far] == edges.tolist()
 
 
