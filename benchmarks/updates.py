@@ -78,7 +78,7 @@ def ours(
     buffer = make_buffer(config, None)
     buffer.extend(plain(rows))
     agent = make_agent(config, actions)
-    return lambda: agent.update(buffer.sample(config.batch_size)), count_parameters(agent.loss)
+    return lambda: agent.update(buffer.sample()), count_parameters(agent.loss)
 
 
 Passes = Sequence[tuple[int, bool]]

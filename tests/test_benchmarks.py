@@ -73,7 +73,7 @@ def test_a_double_update_asks_a_network_once_more(make_agent, passes, monkeypatc
 
 def test_the_cost_of_hindsight_is_measured_on_the_recipes_update():
     config = update_cost.Config(hindsight="none", batch_size=4, replay_capacity=EPISODE)
-    update_cost.make_updates(config, Rows(64).take(EPISODE), None, 2)()
+    update_cost.make_update(config, Rows(64).take(EPISODE), None)()
 
 
 def test_rounds_alternate_and_the_first_does_not_count():
