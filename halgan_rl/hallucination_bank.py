@@ -9,6 +9,7 @@ from torch import Tensor
 from halgan_rl.hallucinators import check_poses
 from halgan_rl.models.halgan import HallucinationGenerator
 from halgan_rl.poses import flag_number, wrap_angle
+from halgan_rl.rows import replace_rows
 
 VISIBLE = 2
 """A line of the image is stored if it changes a black or a white image by more than this [levels of 255]."""
@@ -192,13 +193,10 @@ class HallucinationBank:
         entries = torch.arange(len(images)) + (starts + counts - counts.cumsum(0)).index_select(0, images)
         height, width = pixels.shape[-3:-1]
         places = self._lines.index_select(0, entries) + images * height
-        lines = pixels.clone(memory_format=torch.contiguous_format).view(-1, width, 3)
+        lines = pixels.reshape(-1, width, 3)
         kept, added = self._mattes.index_select(0, entries).to(torch.int16).unbind(1)
         after = lines.index_select(0, places).to(torch.int16).mul_(kept).add_(WHOLE // 2).bitwise_right_shift_(SHIFT)
-        after = after.add_(added).clamp_(max=255).to(torch.uint8)
-        words, new_words = (part.flatten(1).view(torch.int64) for part in (lines, after))  # eight bytes at once
-        words.index_copy_(0, places, new_words)
-        return lines.view(pixels.shape)
+        return replace_rows(lines, places, after.add_(added).clamp_(max=255).to(torch.uint8)).view(pixels.shape)
 
     def _cells_at(self, pose: Tensor, goal_pose: Tensor) -> Tensor:
         """Return the rows of the table ``[N, F]`` for poses ``[N, F, P]`` and goals ``[N, 1, P]``."""

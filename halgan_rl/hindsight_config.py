@@ -4,6 +4,8 @@ import dataclasses
 from pathlib import Path
 from typing import Any, Literal
 
+from halgan_rl.models.halving import Downsample
+
 
 @dataclasses.dataclass(frozen=True)
 class HindsightConfig:
@@ -60,7 +62,7 @@ class HindsightConfig:
     """How far the target networks move towards the networks at each update."""
     clip_targets: bool = True
     """Clip the targets of values to [-1, 1]."""
-    downsample: Literal["stride", "max_pool"] = "stride"
+    downsample: Downsample = "stride"
     """How the convolutions halve the image."""
     policy_average: float = 0.998
     """Decay of the moving average of the policy's weights, which is evaluated and saved; 0 takes the last ones."""
