@@ -111,10 +111,17 @@ def test_priorities_are_written_as_by_torchrl(pair: Pair) -> None:
 
 
 def test_priority_weights_are_heeded(pair: Pair) -> None:
-    weights = torch.rand(pair.rows.shape)
-    rows = pair.rows.clone().set("priority_weight", weights)
-    for name, value in pair.theirs(rows.clone()).items():
-        torch.testing.assert_close(pair.ours(rows)[name], value, rtol=1e-4, atol=1e-5, msg=name)
+    rows = pair.rows.clone().set("priority_weight", torch.rand(pair.rows.shape))
+    assert_heeded(pair, rows)
+
+
+def assert_heeded(pair: Pair, rows: TensorDict) -> None:
+    """Assert that both losses make the same of an entry of the rows, and not the same as without it."""
+    losses, without = pair.ours(rows.clone()), pair.ours(pair.rows.clone())
+    for name, value in pair.theirs(rows).items():
+        torch.testing.assert_close(losses[name], value, rtol=1e-4, atol=1e-5, msg=name)
+        if name.startswith("loss"):
+            assert losses[name].shape != without[name].shape or not torch.allclose(losses[name], without[name])
 
 
 def learn(loss: LossModule, updater: SoftUpdate, rows: TensorDict) -> torch.Tensor:
@@ -205,9 +212,8 @@ def test_rows_without_batch_dimensions_of_their_own_do_the_same(pair: Pair) -> N
 
 
 def test_rows_that_are_masked_do_not_count(pair: Pair) -> None:
-    rows = pair.rows.clone().set(("collector", "mask"), torch.rand(pair.rows.shape) < 0.5)
-    for name, value in pair.theirs(rows.clone()).items():
-        torch.testing.assert_close(pair.ours(rows)[name], value, rtol=1e-4, atol=1e-5, msg=name)
+    mask = torch.arange(pair.rows.numel()).reshape(pair.rows.shape) % 2 == 0
+    assert_heeded(pair, pair.rows.clone().set(("collector", "mask"), mask))
 
 
 def test_one_loss_alone_leaves_zeros_where_torchrl_leaves_nothing() -> None:
