@@ -7,9 +7,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torchrl.objectives import DQNLoss
 
-from halgan_rl.models import agents
 from halgan_rl.models.agents import Actor, Critic, QNetwork, Vision, deterministic_policy, greedy_policy, see
-from halgan_rl.models.halving import Downsample, Halving, halve
+from halgan_rl.models.halving import Downsample
 from halgan_rl.models.pixels import to_float
 
 NETWORKS = {"actor": (Actor, 33_642), "critic": (Critic, 33_673), "ddqn": (QNetwork, 33_708)}
@@ -49,38 +48,53 @@ def test_an_untrained_actor_asks_for_the_middle_of_all_actions_unless_told_other
     assert small < 0.01 < 0.1 < large
 
 
+@pytest.mark.parametrize("networks", [1, 3])
 @pytest.mark.parametrize("downsample", ["stride", "max_pool"])
-def test_activations_stay_channels_last(downsample: Downsample, monkeypatch: pytest.MonkeyPatch) -> None:
-    layouts = []
+def test_activations_stay_channels_last(downsample: Downsample, networks: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen, conv2d = [], F.conv2d
 
-    def spy(*args: Any, **kwargs: Any) -> Tensor:
-        halved = halve(*args, **kwargs)
-        layouts.append(halved.is_contiguous(memory_format=torch.channels_last))
+    def spy(images: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+        halved = conv2d(images, *args, **kwargs)
+        seen.extend([images, halved])
         return halved
 
-    monkeypatch.setattr(agents, "halve", spy)
-    see(frames(2), [Vision(downsample) for _ in range(3)])
-    assert layouts == [True] * 4
+    monkeypatch.setattr(F, "conv2d", spy)
+    see(frames(2), [Vision(downsample) for _ in range(networks)])
+    assert [images.is_contiguous(memory_format=torch.channels_last) for images in seen] == 8 * [True]
 
 
+@pytest.mark.parametrize("learn", [True, False])
+@pytest.mark.parametrize("networks", [1, 2, 3])
 @pytest.mark.parametrize("downsample", ["stride", "max_pool"])
-def test_networks_see_together_what_each_sees_and_what_plain_layers_see(downsample: Downsample) -> None:
+def test_networks_see_together_what_each_sees_and_what_plain_layers_see(
+    downsample: Downsample, networks: int, learn: bool
+) -> None:
     torch.manual_seed(0)
-    visions = [Vision(downsample) for _ in range(3)]
+    visions = [Vision(downsample) for _ in range(networks)]
     pixels = frames(2, 3)
     pixels[0, :, :32] = 200  # where all is the same, pooled outputs are, too
-    together = see(pixels, visions)
-    for vision, seen in zip(visions, together, strict=True):
-        assert seen.shape == (6, 512)
-        torch.testing.assert_close(vision(pixels), seen)
-        features = to_float(pixels)
-        for layer in vision.layers:
-            if isinstance(layer, Halving):
-                features = F.conv2d(features, layer.weight, layer.bias, layer.stride, layer.padding)
-                features = F.max_pool2d(features, 2) if downsample == "max_pool" else features
-            else:
-                features = layer(features)
-        torch.testing.assert_close(seen, features)
+    with torch.set_grad_enabled(learn):
+        together = see(pixels, visions)
+        for vision, seen in zip(visions, together, strict=True):
+            assert seen.shape == (6, 512)
+            torch.testing.assert_close(vision(pixels), seen)
+            torch.testing.assert_close(vision.layers(to_float(pixels)), seen)
+
+
+@pytest.mark.parametrize("networks", [1, 2])
+@pytest.mark.parametrize("downsample", ["stride", "max_pool"])
+def test_networks_learn_together_what_plain_layers_learn(downsample: Downsample, networks: int) -> None:
+    torch.manual_seed(0)
+    visions = [Vision(downsample) for _ in range(networks)]
+    pixels = frames(6)
+    pixels[:, :32] = 200
+    together = torch.cat(see(pixels, visions))
+    plain = torch.cat([vision.layers(to_float(pixels)) for vision in visions])
+    parameters = [parameter for vision in visions for parameter in vision.parameters()]
+    weights = torch.randn_like(plain)
+    got, wanted = (torch.autograd.grad((features * weights).sum(), parameters) for features in (together, plain))
+    for one, other in zip(got, wanted, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
 
 
 def test_actions_stay_in_range_and_depend_on_the_image() -> None:
