@@ -167,6 +167,7 @@ def make_round(recipe: Any, benchmark: Benchmark, out: Path, **changes: Any) -> 
         buffer=buffer,
         hindsight=hindsight,
         schedule=Schedule(benchmark.frames, 0, config.frames_per_update, benchmark.frames),
+        batch_size=config.batch_size,
         policy_average=config.policy_average,
         evaluate=watch.timed(EVALUATION, partial(evaluate_at_once, evaluation_env, seeds=starts)),
         report=Report(make_folder(config, agent, ())),

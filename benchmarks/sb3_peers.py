@@ -154,26 +154,28 @@ def make_model(
     return model
 
 
-Update = Callable[[], object]
+Updates = Callable[[int], object]
+"""Makes so many updates."""
 
 
-def make_ddpg_update(rows: TensorDict, config: HindsightConfig, rate: float) -> tuple[Update, tuple[int, ...]]:
-    """Return an update of DDPG, and the numbers of parameters of actor and critic, each with its own convolutions."""
+def make_ddpg_updates(rows: TensorDict, config: HindsightConfig, rate: float) -> tuple[Updates, tuple[int, ...]]:
+    """Return updates of DDPG, and the numbers of parameters of actor and critic, each with its own convolutions."""
     model = make_model(DDPG, ACTIONS, rows, config, rate)
-    return partial(model.train, gradient_steps=1, batch_size=config.batch_size), _counts(model.actor, model.critic)
+    return partial(model.train, batch_size=config.batch_size), _counts(model.actor, model.critic)
 
 
-def make_dqn_update(rows: TensorDict, config: HindsightConfig, rate: float) -> tuple[Update, tuple[int, ...]]:
-    """Return an update of DQN and of its target, and the number of parameters; the rows' actions are one-hot."""
+def make_dqn_updates(rows: TensorDict, config: HindsightConfig, rate: float) -> tuple[Updates, tuple[int, ...]]:
+    """Return updates of DQN and of its target, and the number of parameters; the rows' actions are one-hot."""
     choices = spaces.Discrete(rows["action"].shape[-1])
     rows = rows.clone(False).set("action", rows["action"].argmax(-1, keepdim=True))
     model = make_model(DQN, choices, rows, config, rate)
 
-    def update() -> None:
-        model.train(gradient_steps=1, batch_size=config.batch_size)
-        polyak_update(model.q_net.parameters(), model.q_net_target.parameters(), model.tau)
+    def run(count: int) -> None:
+        for _ in range(count):
+            model.train(gradient_steps=1, batch_size=config.batch_size)
+            polyak_update(model.q_net.parameters(), model.q_net_target.parameters(), model.tau)
 
-    return update, _counts(model.q_net)
+    return run, _counts(model.q_net)
 
 
 def _counts(*networks: nn.Module) -> tuple[int, ...]:

@@ -4,13 +4,14 @@ Usage::
 
     python -m benchmarks.updates
 
-Ours is the recipe's update: sampling from a ``FrameStorage``, TorchRL's loss with clipped targets (and, in DDPG, the
-price on the actor's pre-activations) and shared passes through the convolutions, one fused Adam. Stable-Baselines3's is
-``DDPG.train`` or ``DQN.train`` with plain convolutions as features extractor, in DDPG one for each of actor and critic
-(it has one learning rate for both). TorchRL's is ``DDPGLoss`` or ``DQNLoss``, an Adam for each network and
-``SoftUpdate`` on a ``LazyTensorStorage`` of images channels first. Peers have networks of plain layers that compute
-the same, in PyTorch's default memory format; TorchRL's in ``channels_last`` as well. The numbers of parameters are
-compared before measuring. One thread, medians of processor time in alternating rounds.
+Ours is the recipe's update: sampling from a ``FrameStorage``, the batches of a round at once; TorchRL's loss with
+clipped targets (and, in DDPG, the price on the actor's pre-activations) and shared passes through the convolutions; one
+fused Adam. Stable-Baselines3's is ``DDPG.train``, with all gradient steps of a round, or ``DQN.train``, with plain
+convolutions as features extractor, in DDPG one for each of actor and critic (it has one learning rate for both).
+TorchRL's is ``DDPGLoss`` or ``DQNLoss``, an Adam for each network and ``SoftUpdate`` on a ``LazyTensorStorage`` of
+images channels first. Peers have networks of plain layers that compute the same, in PyTorch's default memory format;
+TorchRL's in ``channels_last`` as well. The numbers of parameters are compared before measuring. One thread, medians of
+processor time in alternating rounds.
 
 Stable-Baselines3's DQN is not double: it does not ask the online network about next frames, one forward pass less. So
 ours is measured without that pass as well, and compared with that. Its ``train`` leaves the target network to the steps
@@ -45,14 +46,15 @@ from halgan_rl.experiment import make_buffer
 from halgan_rl.hindsight_config import HindsightConfig
 from halgan_rl.models.agents import Actor, Critic, QNetwork, Vision, greedy_policy, see
 from halgan_rl.models.halving import Downsample
-from halgan_rl.training import Agent
+from halgan_rl.training import Agent, draw_batches
 from recipes import ddpg_navigate, ddqn_pebble
 
-Update = Callable[[], object]
+Updates = Callable[[int], object]
+"""Makes so many updates."""
 Counts = tuple[int, ...]
 """Numbers of parameters of actor and critic, or of the one network of action values."""
-Variant = Callable[[Any, TensorDict], tuple[Update, Counts]]
-"""Makes an update for a recipe's configuration and the rows of a buffer."""
+Variant = Callable[[Any, TensorDict], tuple[Updates, Counts]]
+"""Makes updates for a recipe's configuration and the rows of a buffer."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,7 +63,7 @@ class Benchmark:
 
     rounds: int = 7
     """Alternating rounds; the median is reported."""
-    updates: int = 5
+    updates: int = 8
     """Updates a round."""
     rows: int = 5_000
     """Rows in the buffers."""
@@ -73,25 +75,30 @@ class Benchmark:
 
 def ours(
     make_agent: Callable[[Any, TensorSpec], Agent], actions: TensorSpec, config: HindsightConfig, rows: TensorDict
-) -> tuple[Update, Counts]:
-    """Return the recipe's update, and the numbers of parameters."""
+) -> tuple[Updates, Counts]:
+    """Return the recipe's updates, and the numbers of parameters."""
     buffer = make_buffer(config, None)
     buffer.extend(plain(rows))
     agent = make_agent(config, actions)
-    return lambda: agent.update(buffer.sample()), count_parameters(agent.loss)
+
+    def run(count: int) -> None:
+        for batch in draw_batches(buffer, count, config.batch_size):
+            agent.update(batch)
+
+    return run, count_parameters(agent.loss)
 
 
 Passes = Sequence[tuple[int, bool]]
 """Passes through convolutions: how many networks share one, and whether they learn by it."""
 
 
-def convolutions(config: HindsightConfig, rows: TensorDict, passes: Passes) -> Update:
+def convolutions(config: HindsightConfig, rows: TensorDict, passes: Passes) -> Updates:
     """Return the convolutions of our update: forward, and back where they learn."""
     pixels = rows["pixels"][: config.batch_size]
     networks = [[Vision(config.downsample) for _ in range(count)] for count, _ in passes]
 
-    def run() -> None:
-        for visions, (_, learns) in zip(networks, passes, strict=True):
+    def run(count: int) -> None:
+        for visions, (_, learns) in count * list(zip(networks, passes, strict=True)):
             with torch.set_grad_enabled(learns):
                 features = see(pixels, visions)
             if learns:
@@ -142,15 +149,20 @@ def torchrl_loop(
     memory_format: torch.memory_format,
     config: HindsightConfig,
     rows: TensorDict,
-) -> tuple[Update, Counts]:
-    """Return TorchRL's plain update, and the numbers of parameters."""
+) -> tuple[Updates, Counts]:
+    """Return TorchRL's plain updates, and the numbers of parameters."""
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(len(rows)), batch_size=config.batch_size)
     buffer.extend(plain(rows).update({"pixels": channels_first(rows["pixels"])}).update(_next_channels_first(rows)))
     loss, rates = make_loss(config, memory_format)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=config.discount)
     optimizers = [torch.optim.Adam(parameters.values(True, True), lr=rate) for parameters, rate in rates]
     target_updater = SoftUpdate(loss, tau=config.target_rate)
-    return partial(_torchrl_update, buffer, loss, optimizers, target_updater), count_parameters(loss)
+
+    def run(count: int) -> None:
+        for _ in range(count):
+            _torchrl_update(buffer, loss, optimizers, target_updater)
+
+    return run, count_parameters(loss)
 
 
 def _next_channels_first(rows: TensorDict) -> dict[str, dict[str, Tensor]]:
@@ -168,14 +180,14 @@ def _torchrl_update(
     target_updater.step()
 
 
-def sb3_ddpg(config: ddpg.DDPGConfig, rows: TensorDict) -> tuple[Update, Counts]:
-    """Return Stable-Baselines3's update, and the numbers of parameters."""
-    return sb3_peers.make_ddpg_update(rows, config, config.critic_learning_rate)
+def sb3_ddpg(config: ddpg.DDPGConfig, rows: TensorDict) -> tuple[Updates, Counts]:
+    """Return Stable-Baselines3's updates, and the numbers of parameters."""
+    return sb3_peers.make_ddpg_updates(rows, config, config.critic_learning_rate)
 
 
-def sb3_dqn(config: ddqn.DDQNConfig, rows: TensorDict) -> tuple[Update, Counts]:
-    """Return Stable-Baselines3's update, which is not double, and the numbers of parameters."""
-    return sb3_peers.make_dqn_update(rows, config, config.learning_rate)
+def sb3_dqn(config: ddqn.DDQNConfig, rows: TensorDict) -> tuple[Updates, Counts]:
+    """Return Stable-Baselines3's updates, not double, and the numbers of parameters."""
+    return sb3_peers.make_dqn_updates(rows, config, config.learning_rate)
 
 
 def count_parameters(loss: LossModule) -> Counts:
@@ -229,8 +241,8 @@ ALGORITHMS = {
 }
 
 
-def make_updates(algorithm: Algorithm, rows: TensorDict, **changes: Any) -> dict[str, Update]:
-    """Return an update of each variant, and their convolutions alone; the networks have the same numbers of parameters.
+def make_updates(algorithm: Algorithm, rows: TensorDict, **changes: Any) -> dict[str, Updates]:
+    """Return the updates of each variant and our convolutions alone; the networks have the same numbers of parameters.
 
     Args:
         algorithm: what to measure.
@@ -263,8 +275,8 @@ def measure(benchmark: Benchmark) -> dict[Case, float]:
     ):
         downsample, size = options
         for name, run in make_updates(made, rows, batch_size=size, downsample=downsample).items():
-            measures[algorithm, downsample, size, name] = partial(seconds_a_call, run, benchmark.updates)
-    return alternate(measures, benchmark.rounds)
+            measures[algorithm, downsample, size, name] = partial(seconds_a_call, partial(run, benchmark.updates), 1)
+    return {case: value / benchmark.updates for case, value in alternate(measures, benchmark.rounds).items()}
 
 
 def our(name: str) -> str:

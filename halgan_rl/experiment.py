@@ -109,6 +109,7 @@ def run(config: Config, make_agent: Callable[[Config, TensorSpec], Agent], simul
             schedule=Schedule(
                 config.total_frames, config.warmup_frames, config.frames_per_update, config.evaluate_every
             ),
+            batch_size=config.batch_size,
             policy_average=config.policy_average,
             evaluate=evaluate,
             report=Report(folder, make_tensorboard(config)),
@@ -215,7 +216,6 @@ def make_buffer(config: HindsightConfig, hindsight: Compose | None) -> TensorDic
     """Return the replay buffer; room for final frames suffices for episodes of four steps on average."""
     return TensorDictReplayBuffer(
         storage=FrameStorage(config.replay_capacity, extra_frames=config.replay_capacity // 4),
-        batch_size=config.batch_size,
         transform=hindsight,
         generator=torch.Generator().manual_seed(config.seed),
     )

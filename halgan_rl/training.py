@@ -1,7 +1,7 @@
 """The loop that all agents share: collect, replay with hindsight, update, evaluate."""
 
 import copy
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import TypeVar
@@ -106,6 +106,20 @@ class Schedule:
         return max(frames - self.warmup_frames, 0) // self.frames_per_update
 
 
+AT_ONCE = 16
+"""Batches sampled together: hindsight costs little more than its memory traffic then; more would only take memory."""
+
+
+def draw_batches(buffer: TensorDictReplayBuffer, count: int, size: int) -> Iterator[TensorDictBase]:
+    """Yield so many batches of so many rows of a buffer, to which nothing is added between them.
+
+    They are sampled together. Most of what hindsight costs is its number of operations on small tensors: on sixteen
+    batches at once they cost hardly more than on one.
+    """
+    for first in range(0, count, AT_ONCE):
+        yield from buffer.sample(min(AT_ONCE, count - first) * size).split(size)
+
+
 def train(
     agent: Agent,
     collector: Iterable[TensorDictBase],
@@ -113,6 +127,7 @@ def train(
     *,
     hindsight: Compose | None,
     schedule: Schedule,
+    batch_size: int,
     policy_average: float,
     evaluate: Callable[[TensorDictModuleBase], Future[Evaluation]],
     report: Report,
@@ -127,6 +142,7 @@ def train(
         buffer: where they go; samples come with hindsight.
         hindsight: the buffer's pipeline, see :mod:`halgan_rl.pipelines`, whose probability this anneals; None for none.
         schedule: when what happens.
+        batch_size: rows an update.
         policy_average: decay of the moving average of the network's weights, which is evaluated and saved; 0 takes the
             last weights.
         evaluate: judges a policy as it is when handed over, at once or beside training.
@@ -151,8 +167,7 @@ def train(
         if (done := rollout["next", "done"]).any():
             means.add(success_rate=rollout["next", "terminated"][done].float().mean())
 
-        while updates < schedule.updates_due(frames):
-            batch = buffer.sample()
+        for batch in draw_batches(buffer, schedule.updates_due(frames) - updates, batch_size):
             losses = agent.update(batch)
             average.update_parameters(agent.network)
             updates += 1

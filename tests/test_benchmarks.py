@@ -46,7 +46,7 @@ def test_replay_compares_every_buffer_at_every_size():
 @pytest.mark.parametrize("algorithm", updates.ALGORITHMS.values(), ids=updates.ALGORITHMS)
 def test_updates_run_on_networks_of_the_same_size(algorithm):
     for run in updates.make_updates(algorithm, Rows(64).take(EPISODE)).values():
-        run()
+        run(1)
 
 
 @pytest.mark.parametrize("algorithm", updates.ALGORITHMS.values(), ids=updates.ALGORITHMS)
@@ -70,13 +70,13 @@ def test_a_double_update_asks_a_network_once_more(make_agent, passes, monkeypatc
         return halve(images, networks, *how)
 
     monkeypatch.setattr(agents, "halve", spy)
-    run()
+    run(1)
     assert len(asked) == passes
 
 
 def test_the_cost_of_hindsight_is_measured_on_the_recipes_update():
     config = update_cost.Config(hindsight="none", batch_size=4, replay_capacity=EPISODE)
-    update_cost.make_update(config, Rows(64).take(EPISODE), None)()
+    update_cost.make_updates(config, Rows(64).take(EPISODE), None, 2)()
 
 
 def test_rounds_alternate_and_the_first_does_not_count():
