@@ -14,6 +14,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, dispatch
 from torch import Tensor, nn
+from torch.nn import functional as F
 from torchrl.objectives import DQNLoss, LossModule
 from torchrl.objectives.utils import distance_loss
 
@@ -41,6 +42,16 @@ def filled(network: nn.Module, parameters: TensorDictBase) -> Any:
     copied = copy.deepcopy(network)
     parameters.to_module(copied)
     return copied
+
+
+def _pass_through(head: nn.Sequential, features: Tensor) -> Tensor:
+    """Return what a head makes of features, with gradients for these only."""
+    for layer in head:
+        if isinstance(layer, nn.Linear):
+            features = F.linear(features, layer.weight.detach(), layer.bias.detach())
+        else:
+            features = layer(features)
+    return features
 
 
 class OnePassDDPGLoss(_OnePassLoss, UnsaturatedDDPGLoss):
@@ -83,19 +94,13 @@ class OnePassDDPGLoss(_OnePassLoss, UnsaturatedDDPGLoss):
             policy, judge, delay_actor=True, delay_value=True, preactivation_key=preactivation_key, **kwargs
         )
         self.pixels_key, self.action_key = pixels_key, action_key
-        _ = self._cached_networks, self._cached_judge  # now: where the loss is compiled is no place to copy networks
+        _ = self._cached_networks  # now: where the loss is compiled is no place to copy networks
 
     @cached_property  # TorchRL erases what is called _cached... when the parameters move
     def _cached_networks(self) -> tuple[tuple[Actor, Critic], tuple[Actor, Critic]]:
         actors, critics = self._modules_of("actor_network"), self._modules_of("value_network")
         online, target = ((actor[0].module, critic.module) for actor, critic in zip(actors, critics, strict=True))
         return online, target
-
-    @cached_property
-    def _cached_judge(self) -> nn.Module:
-        """The critic's head, which lets gradients through and gets none."""
-        parameters = dict(self.named_children())["value_network_params"]
-        return filled(self.value_network, parameters.detach()).module.head.requires_grad_(False)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -108,7 +113,7 @@ class OnePassDDPGLoss(_OnePassLoss, UnsaturatedDDPGLoss):
         value = critic.judge(critic_features, action.reshape(-1, action.shape[-1])).reshape(shape)
         preactivation = actor.head(actor_features)
         joined = torch.cat([critic_features.detach(), preactivation.tanh()], -1)
-        reached = self._cached_judge(joined).squeeze(-1)
+        reached = _pass_through(critic.head, joined).squeeze(-1)
         price = self.preactivation_weight * preactivation.square().mean(-1)
 
         td_error = (value - target).square().detach()

@@ -114,10 +114,21 @@ def draw_batches(buffer: TensorDictReplayBuffer, count: int, size: int) -> Itera
     """Yield so many batches of so many rows of a buffer, to which nothing is added between them.
 
     They are sampled together. Most of what hindsight costs is its number of operations on small tensors: on sixteen
-    batches at once they cost hardly more than on one.
+    batches at once they cost hardly more than on one. What updates write, such as priorities, counts from the next
+    sixteen on.
+
+    Raises:
+        ValueError: if the buffer gives another number of rows than it is asked for.
     """
     for first in range(0, count, AT_ONCE):
-        yield from buffer.sample(min(AT_ONCE, count - first) * size).split(size)
+        asked = min(AT_ONCE, count - first) * size
+        rows = buffer.sample(asked)
+        if len(rows) != asked:
+            raise ValueError(
+                f"asked for {asked} rows, the replay buffer gave {len(rows)}: use a sampler with replacement, and no "
+                "prefetch, which gives the number that was asked for before"
+            )
+        yield from rows.split(size)
 
 
 def train(

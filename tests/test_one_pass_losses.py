@@ -220,7 +220,6 @@ def test_one_loss_alone_leaves_zeros_where_torchrl_leaves_nothing() -> None:
     torch.manual_seed(0)
     pair = ddpg()
     pair.ours.make_value_estimator(gamma=0.9)
-    pair.ours.make_value_estimator(gamma=0.9)
     FusedSoftUpdate(pair.ours, tau=0.1)
     pair.ours(pair.rows)["loss_value"].backward()
     gradients = [value.grad for value in pair.ours.actor_network_params.values(True, True)]
@@ -244,15 +243,21 @@ def test_networks_of_different_kinds_are_refused() -> None:
 def test_targets_are_clipped() -> None:
     torch.manual_seed(0)
     pair = ddpg()
-    pair.ours.make_value_estimator(gamma=0.9)
     estimator = ClippedTD0Estimator(low=-0.1, high=0.1, gamma=0.9, value_network=pair.ours.actor_critic)
     pair.ours.make_value_estimator(estimator)
     FusedSoftUpdate(pair.ours, tau=0.1)
     assert pair.ours(pair.rows)["target_value"].abs().max() <= 0.1 + 1e-6
 
 
-def test_the_critic_that_judges_the_actor_gathers_no_gradients() -> None:
+def test_parameters_that_are_replaced_count_at_once() -> None:
+    torch.manual_seed(0)
     pair = ddpg()
     pair.ours.make_value_estimator(gamma=0.9)
-    pair.ours(pair.rows)["loss_actor"].sum().backward()
-    assert all(parameter.grad is None for parameter in pair.ours._cached_judge.parameters())
+    FusedSoftUpdate(pair.ours, tau=0.1)
+    before = pair.ours(pair.rows)
+    for parameter in pair.ours.value_network_params.values(True, True):
+        parameter.data = 2 * parameter.data  # not in place
+    after, of_a_copy = pair.ours(pair.rows), copy.deepcopy(pair.ours)(pair.rows)
+    for name in ("loss_actor", "loss_value"):
+        torch.testing.assert_close(after[name], of_a_copy[name])
+        assert not torch.allclose(after[name], before[name])

@@ -1,9 +1,11 @@
 """Batches for updates are sampled together."""
 
+from typing import Any
+
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
 
 from halgan_rl import training
 
@@ -32,3 +34,15 @@ def test_a_batch_is_drawn_by_the_same_draws_as_alone() -> None:
     together = torch.cat([batch["row"] for batch in training.draw_batches(buffers[0], 3, 4)])
     torch.manual_seed(0)
     assert torch.equal(together, torch.cat([buffers[1].sample(4)["row"] for _ in range(3)]))
+
+
+@pytest.mark.parametrize(
+    ("options", "gave"),
+    [({"sampler": SamplerWithoutReplacement()}, 100), ({"prefetch": 2, "batch_size": 8}, 128)],
+    ids=["without replacement", "prefetch"],
+)
+def test_buffers_that_give_another_number_of_rows_are_refused(options: dict[str, Any], gave: int) -> None:
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100), **options)
+    buffer.extend(TensorDict({"row": torch.arange(100)}, batch_size=[100]))
+    with pytest.raises(ValueError, match=f"asked for .* rows, .* gave {gave}"):
+        list(training.draw_batches(buffer, 20, 8))

@@ -21,14 +21,16 @@ learning", 2016, section 7)."""
 _ACTIVATION = partial(nn.functional.leaky_relu, negative_slope=LEAK)
 
 _SQUARE = (Layout(writes=(2, 2)), Layout(reads=(2, 2), writes=(2, 1)))
+"""The first two layers of one network."""
 _TALL = (Layout(writes=(2, 1)), Layout(reads=(2, 1), writes=(2, 1)))
+"""The first two layers of several networks."""
 
 
 def _layouts(downsample: Downsample, networks: int, *, learn: bool) -> tuple[Layout, ...]:
     """Return the layouts of the four layers that took least time, of all that fit, on a core with AVX-512.
 
-    One network alone has half the channels of two, and larger blocks make up for it. Backward, a stride of 2 costs more
-    than cutting the images into blocks, of which it is a stride of 1.
+    One network alone has half the channels of two, and larger blocks make up for it; three or more were not measured.
+    Backward, a stride of 2 costs more than cutting the images into blocks, of which it is a stride of 1.
     """
     if downsample == "max_pool":
         return Layout(writes=(2, 2)), Layout(reads=(2, 2)), PLAIN, PLAIN
@@ -100,8 +102,8 @@ def see(pixels: Tensor, visions: Sequence[Vision]) -> tuple[Tensor, ...]:
         raise ValueError(f"pixels must be uint8 [..., 64, 64, 3], got {pixels.dtype} {list(pixels.shape)}")
     images = to_float(pixels)
     downsample, networks = visions[0].downsample, [vision.halvings for vision in visions]
-    on_blocks = images.is_cpu and not torch.compiler.is_compiling()
-    layouts = _layouts(downsample, len(visions), learn=torch.is_grad_enabled()) if on_blocks else 4 * (PLAIN,)
+    plain = torch.compiler.is_compiling() or not images.is_cpu
+    layouts = 4 * (PLAIN,) if plain else _layouts(downsample, len(visions), learn=torch.is_grad_enabled())
     return halve(images, networks, layouts, _ACTIVATION).flatten(1).chunk(len(visions), -1)
 
 

@@ -7,7 +7,6 @@ cut into blocks as well. The sums are the same, but for their order; the zeros c
 """
 
 import itertools
-import math
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Literal, NamedTuple
@@ -19,7 +18,7 @@ from torch.nn import functional as F
 Downsample = Literal["stride", "max_pool"]
 
 Blocks = tuple[int, int]
-"""Height and width of blocks."""
+"""Height and width of blocks [pixels]."""
 
 
 class Layout(NamedTuple):
@@ -43,7 +42,7 @@ class Halving(nn.Conv2d):
         downsample: ``"stride"`` 2, or ``"max_pool"`` of 2x2.
 
     Raises:
-        ValueError: if ``downsample`` is neither.
+        ValueError: if ``downsample`` is neither, or ``kernel_size`` even.
 
     Examples:
         >>> Halving(3, 4, 5)(torch.zeros(5, 3, 64, 64)).shape
@@ -57,50 +56,54 @@ class Halving(nn.Conv2d):
     ) -> None:
         if downsample not in ("stride", "max_pool"):
             raise ValueError(f"downsample={downsample!r} is unknown: choose 'stride' or 'max_pool'")
+        if kernel_size % 2 == 0:
+            raise ValueError(f"kernel_size={kernel_size} must be odd, or the kernel has no middle")
         pool = 2 if downsample == "max_pool" else 1
         super().__init__(in_channels, out_channels, kernel_size, stride=2 // pool, padding=kernel_size // 2)
         self.pool = pool
 
     def forward(self, images: Tensor) -> Tensor:
         """Return images ``[N, O, H / 2, W / 2]`` of images ``[N, C, H, W]``, float."""
-        halved = super().forward(images)
-        return F.max_pool2d(halved, 2) if self.pool == 2 else halved
+        return halve(images, [[self]], [PLAIN])
 
 
 def halve(
     images: Tensor,
     networks: Sequence[Sequence[Halving]],
     layouts: Sequence[Layout],
-    activation: Callable[[Tensor], Tensor],
+    activation: Callable[[Tensor], Tensor] = nn.Identity(),  # noqa: B008 (has no state)
 ) -> Tensor:
     """Return images halved by the layers of several networks: the same as by each of them, but for rounding.
 
     A layer of all networks is one convolution.
 
     Args:
-        images: float ``[N, C, H, W]``; all networks see them.
+        images: float ``[N, C, H, W]``; all networks see them. On the CPU, unless all layouts are plain.
         networks: their layers, from the first to the last; alike but for their parameters.
-        layouts: of each layer; they decide how long it takes.
+        layouts: of each layer; they decide how long it takes. The last one writes no blocks.
         activation: of each element, behind each layer.
 
     Returns:
-        The networks' images one after another, float ``[N, G * O, H', W']``, G the number of networks; in the blocks
-        that the last layout writes.
+        The networks' images one after another, float ``[N, G * O, H', W']``, G the number of networks.
 
     Raises:
-        ValueError: if blocks do not fit together, or do not divide a layer's padding.
+        ValueError: if the networks differ, or if blocks do not fit together, the layers' padding or the images.
     """
-    groups, lie = len(networks), PLAIN.writes
-    kernels = _lay_out(networks, tuple(layouts))
-    for depth, (layer, layout, (weight, bias)) in enumerate(zip(networks[0], layouts, kernels, strict=True)):
+    kinds = [tuple((*layer.weight.shape[:3], layer.pool) for layer in network) for network in networks]
+    if any(kind != kinds[0] for kind in kinds):
+        raise ValueError(f"networks that share a pass need the same layers, got {kinds} (outputs, inputs, size, pool)")
+    plain = all(layout == PLAIN for layout in layouts)
+    kernels = _join(networks) if plain else _lay_out(networks, kinds[0], tuple(layouts), tuple(images.shape[2:]))
+    groups, lie = 1, PLAIN.writes
+    for (_, _, size, pool), layout, (weight, bias) in zip(kinds[0], layouts, kernels, strict=True):
         images = _reblock(images, lie, layout.reads, groups)
-        pool = layer.pool if layout == PLAIN else 1  # otherwise the neighbours in a pool are channels
-        stride = [2 * write // (read * pool) for read, write in zip(layout.reads, layout.writes, strict=True)]
-        padding = [layer.kernel_size[0] // 2 // read for read in layout.reads]
-        images = F.conv2d(images, weight, bias, stride, padding, groups=groups if depth else 1)
-        if layer.pool == 2:
+        pooled = pool if layout == PLAIN else 1  # otherwise the neighbours in a pool are channels
+        stride = [2 * write // (read * pooled) for read, write in zip(layout.reads, layout.writes, strict=True)]
+        images = F.conv2d(images, weight, bias, stride, [size // 2 // read for read in layout.reads], groups=groups)
+        groups, lie = len(networks), layout.writes
+        if pool == 2:
             images = F.max_pool2d(images, 2) if layout == PLAIN else _largest_of_four(images, groups)
-        images, lie = activation(images), layout.writes
+        images = activation(images)
     return images
 
 
@@ -111,8 +114,6 @@ def _reblock(images: Tensor, lie: Blocks, asked: Blocks, groups: int) -> Tensor:
     """
     if lie == asked:
         return images
-    if any(new % old for old, new in zip(lie, asked, strict=True)):
-        raise ValueError(f"images in blocks of {lie} cannot be read in blocks of {asked}: choose multiples of those")
     count, channels, height, width = images.shape
     rows, columns = asked[0] // lie[0], asked[1] // lie[1]
     shape = count, height // rows, rows, width // columns, columns, groups, lie[1], channels // (groups * lie[1])
@@ -130,16 +131,25 @@ def _largest_of_four(images: Tensor, groups: int) -> Tensor:
     return largest.permute(0, 2, 3, 1).unflatten(2, (-1, groups)).flatten(3).permute(0, 3, 1, 2)
 
 
-def _lay_out(networks: Sequence[Sequence[Halving]], layouts: tuple[Layout, ...]) -> list[tuple[Tensor, Tensor]]:
-    """Return the weights and biases of each layer's convolution for all networks; for blocks all gathered at once."""
-    if all(layout == PLAIN for layout in layouts):
-        depths = zip(*networks, strict=True)
-        return [
-            (torch.cat([one.weight for one in layers]), torch.cat([one.bias for one in layers])) for layers in depths
-        ]
+Kernels = list[tuple[Tensor, Tensor]]
+"""Weights and biases of each layer of all networks."""
+Kind = tuple[int, int, int, int]
+"""A layer's outputs, inputs, kernel size and pool."""
+
+
+def _join(networks: Sequence[Sequence[Halving]]) -> Kernels:
+    """Return the layers' own parameters, those of all networks one after another."""
+    depths = list(zip(*networks, strict=True))
+    weights = [torch.cat([layer.weight for layer in layers]) for layers in depths]
+    return list(zip(weights, [torch.cat([layer.bias for layer in layers]) for layers in depths], strict=True))
+
+
+def _lay_out(
+    networks: Sequence[Sequence[Halving]], kinds: tuple[Kind, ...], layouts: tuple[Layout, ...], size: tuple[int, ...]
+) -> Kernels:
+    """Return what the convolutions on blocks need, all of it gathered from the layers' parameters in one step."""
+    table = _make_table(kinds, len(networks), layouts, size)
     layers = [layer for network in networks for layer in network]
-    shapes = tuple(tuple(layer.weight.shape) for layer in networks[0])
-    table = _make_table(shapes, layers[0].pool, len(networks), layouts)
     flat = [part for layer in layers for part in (layer.weight.permute(0, 2, 3, 1).reshape(-1), layer.bias)]
     parts = torch.cat([flat[0].new_zeros(1), *flat]).index_select(0, table.places).split(table.sizes)
     weights = [part.view(shape).permute(0, 3, 1, 2) for part, shape in zip(parts[::2], table.shapes, strict=True)]
@@ -161,18 +171,36 @@ class _Table(NamedTuple):
 
 
 @cache
-def _make_table(shapes: tuple[tuple[int, ...], ...], pool: int, groups: int, layouts: tuple[Layout, ...]) -> _Table:
+def _make_table(kinds: tuple[Kind, ...], groups: int, layouts: tuple[Layout, ...], size: tuple[int, ...]) -> _Table:
+    _check_fit(kinds, layouts, size)
+    counts = [count for outputs, inputs, side, _ in kinds for count in (outputs * inputs * side**2, outputs)]
     with torch.inference_mode(False), torch.device("cpu"):
-        sizes = [size for outputs, *others in shapes for size in (outputs * math.prod(others), outputs)]
-        numbers = torch.arange(1, 1 + groups * sum(sizes)).view(groups, -1).split(sizes, 1)
+        numbers = torch.arange(1, 1 + groups * sum(counts)).view(groups, -1).split(counts, 1)
         parts, kernels = [], []
-        for shape, layout, weights, biases in zip(shapes, layouts, numbers[::2], numbers[1::2], strict=True):
-            outputs, inputs, size, _ = shape
-            weights = weights.reshape(groups, outputs, size, size, inputs)
+        for kind, layout, weights, biases in zip(kinds, layouts, numbers[::2], numbers[1::2], strict=True):
+            outputs, inputs, side, pool = kind
+            weights = weights.reshape(groups, outputs, side, side, inputs)
             kernels.append(_spread(weights, 1 if layout == PLAIN else pool, layout))
             parts += [kernels[-1], biases.repeat(1, len(kernels[-1]) // biases.numel())]
         places = torch.cat([part.flatten() for part in parts])
     return _Table(places, [part.numel() for part in parts], [kernel.shape for kernel in kernels])
+
+
+def _check_fit(kinds: tuple[Kind, ...], layouts: tuple[Layout, ...], size: tuple[int, ...]) -> None:
+    """Refuse blocks that do not fit together, nor the layers, nor images of some height and width."""
+    lie = PLAIN.writes
+    for depth, ((_, _, side, _), layout) in enumerate(zip(kinds, layouts, strict=True)):
+        for pixels, before, read, write in zip(size, lie, *layout, strict=True):
+            step = 2 * write
+            if read % before or step % read or (side // 2) % read or (pixels >> depth) % step:
+                raise ValueError(
+                    f"{layout} does not fit layer {depth}: the blocks that are read must be multiples of those before, "
+                    f"{lie}, and divide its padding, {side // 2}, and twice those that are written, which must divide "
+                    f"the image's {size[0] >> depth}x{size[1] >> depth} pixels"
+                )
+        lie = layout.writes
+    if lie != (1, 1):
+        raise ValueError(f"the last layer writes blocks of {lie}, which nothing reads: let it write (1, 1)")
 
 
 def _spread(weights: Tensor, pool: int, layout: Layout) -> Tensor:
@@ -182,11 +210,7 @@ def _spread(weights: Tensor, pool: int, layout: Layout) -> Tensor:
     """
     (rows, columns), (height, width) = layout
     groups, outputs, size, _, inputs = weights.shape
-    step, padding = 2 // pool, size // 2
-    if any(padding % read or 2 * write % read for read, write in zip(*layout, strict=True)):
-        raise ValueError(
-            f"{layout}: blocks that are read must divide the padding, {padding}, and twice the blocks that are written"
-        )
+    step = 2 // pool
     reach = [size + step * (pool * side - 1) for side in layout.writes]
     reach = [reached + -reached % read for reached, read in zip(reach, layout.reads, strict=True)]
     kernels = weights.new_zeros(groups, pool, pool, width, height, outputs, *reach, inputs)

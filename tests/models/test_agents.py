@@ -7,8 +7,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torchrl.objectives import DQNLoss
 
+from halgan_rl.models import agents
 from halgan_rl.models.agents import Actor, Critic, QNetwork, Vision, deterministic_policy, greedy_policy, see
-from halgan_rl.models.halving import Downsample
+from halgan_rl.models.halving import PLAIN, Downsample, halve
 from halgan_rl.models.pixels import to_float
 
 NETWORKS = {"actor": (Actor, 33_642), "critic": (Critic, 33_673), "ddqn": (QNetwork, 33_708)}
@@ -48,9 +49,12 @@ def test_an_untrained_actor_asks_for_the_middle_of_all_actions_unless_told_other
     assert small < 0.01 < 0.1 < large
 
 
+@pytest.mark.parametrize("learn", [True, False])
 @pytest.mark.parametrize("networks", [1, 3])
 @pytest.mark.parametrize("downsample", ["stride", "max_pool"])
-def test_activations_stay_channels_last(downsample: Downsample, networks: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_activations_stay_channels_last(
+    downsample: Downsample, networks: int, learn: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     seen, conv2d = [], F.conv2d
 
     def spy(images: Tensor, *args: Any, **kwargs: Any) -> Tensor:
@@ -59,7 +63,8 @@ def test_activations_stay_channels_last(downsample: Downsample, networks: int, m
         return halved
 
     monkeypatch.setattr(F, "conv2d", spy)
-    see(frames(2), [Vision(downsample) for _ in range(networks)])
+    with torch.set_grad_enabled(learn):
+        see(frames(2), [Vision(downsample) for _ in range(networks)])
     assert [images.is_contiguous(memory_format=torch.channels_last) for images in seen] == 8 * [True]
 
 
@@ -95,6 +100,26 @@ def test_networks_learn_together_what_plain_layers_learn(downsample: Downsample,
     got, wanted = (torch.autograd.grad((features * weights).sum(), parameters) for features in (together, plain))
     for one, other in zip(got, wanted, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
+
+
+def test_layouts_are_chosen_for_what_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def spy(images: Tensor, networks: Any, layouts: Any, activation: Any) -> Tensor:
+        asked.append(tuple(layouts))
+        return halve(images, networks, layouts, activation)
+
+    monkeypatch.setattr(agents, "halve", spy)
+    visions = [Vision(), Vision()]
+    for networks in (visions[:1], visions):
+        see(frames(2), networks)
+        with torch.no_grad():
+            see(frames(2), networks)
+    assert len(set(asked)) == 4
+    asked.clear()
+    torch.compile(visions[0], fullgraph=True, backend="eager")(frames(2))
+    see(frames(2).to("meta"), [Vision().to("meta")])
+    assert set(asked) == {4 * (PLAIN,)}
 
 
 def test_actions_stay_in_range_and_depend_on_the_image() -> None:

@@ -52,13 +52,15 @@ def check(images: Tensor, networks: list[list[Halving]], layouts: list[Layout]) 
 
 @pytest.mark.parametrize("networks", [1, 3])
 @pytest.mark.parametrize("downsample", DOWNSAMPLES)
-@pytest.mark.parametrize(("between", "last"), list(itertools.product(BLOCKS, [PLAIN, Layout(reads=(2, 2))])))
+@pytest.mark.parametrize("last", [PLAIN, Layout(reads=(2, 2))])
+@pytest.mark.parametrize("between", BLOCKS)
+@pytest.mark.parametrize("first", [(1, 1), (2, 1), (1, 2)])
 def test_blocks_change_neither_values_nor_gradients(
-    downsample: Downsample, networks: int, between: Blocks, last: Layout
+    downsample: Downsample, networks: int, first: Blocks, between: Blocks, last: Layout
 ) -> None:
     torch.manual_seed(0)
     made = [make_network(downsample, 3, 4, 2, 3) for _ in range(networks)]
-    check(make_images(3), made, [Layout(writes=between), Layout(reads=between), last])
+    check(make_images(3), made, [Layout(first, between), Layout(reads=between), last])
 
 
 @pytest.mark.parametrize("downsample", DOWNSAMPLES)
@@ -76,24 +78,57 @@ def test_a_layer_alone_is_plain(downsample: Downsample) -> None:
     torch.testing.assert_close(layers[1](layers[0](images).tanh()).tanh(), plain(images, layers))
 
 
-@pytest.mark.parametrize("reads", [(4, 1), (1, 4)])
-def test_blocks_that_do_not_fit_are_refused(reads: Blocks) -> None:
-    with pytest.raises(ValueError, match=r"must divide the padding, 2, and twice the blocks that are written"):
-        halve(make_images(3), [make_network("stride", 3, 4)], [Layout(reads, writes=(2, 2))], torch.tanh)
+@pytest.mark.parametrize("downsample", DOWNSAMPLES)
+@pytest.mark.parametrize("side", [13, 14, 15, 16])
+def test_plain_layers_take_images_of_any_size(downsample: Downsample, side: int) -> None:
+    check(make_images(3, side), [make_network(downsample, 3, 4, 2) for _ in range(2)], 2 * [PLAIN])
 
 
-def test_blocks_do_not_shrink() -> None:
-    network, layouts = make_network("stride", 3, 4, 2), [Layout(writes=(2, 1)), Layout(reads=(1, 2))]
-    with pytest.raises(ValueError, match=r"blocks of \(2, 1\) cannot be read in blocks of \(1, 2\)"):
-        halve(make_images(3), [network], layouts, torch.tanh)
+@pytest.mark.parametrize(
+    ("side", "layouts"),
+    [
+        (16, [Layout((4, 1), (2, 2)), Layout((2, 2))]),  # not within the padding
+        (16, [Layout((1, 1), (2, 1)), Layout((1, 2))]),  # not multiples of those before
+        (18, [Layout((1, 1), (2, 2)), Layout((2, 2))]),  # not within the image
+        (17, [Layout((1, 1), (2, 2)), Layout((2, 2))]),
+        (14, [PLAIN, Layout((2, 2))]),
+    ],
+)
+def test_blocks_that_do_not_fit_are_refused(side: int, layouts: list[Layout]) -> None:
+    with pytest.raises(ValueError, match=r"does not fit layer [01]"):
+        halve(make_images(3, side), [make_network("stride", 3, 4, 2)], layouts)
+
+
+def test_blocks_that_nothing_reads_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"the last layer writes blocks of \(2, 1\)"):
+        halve(make_images(3), [make_network("stride", 3, 4)], [Layout(writes=(2, 1))])
+
+
+@pytest.mark.parametrize("layout", [PLAIN, Layout(reads=(2, 1))])
+def test_networks_that_differ_are_refused(layout: Layout) -> None:
+    one = make_network("stride", 3, 4)
+    for other in (make_network("max_pool", 3, 4), make_network("stride", 3, 5), make_network("stride", 3, 4, 4)):
+        with pytest.raises(ValueError, match="need the same layers"):
+            halve(make_images(3), [one, other], [layout])
+
+
+def test_a_network_may_halve_in_both_ways() -> None:
+    torch.manual_seed(0)
+    made = [[*make_network("max_pool", 3, 4), *make_network("stride", 4, 2)] for _ in range(2)]
+    check(make_images(3), made, [Layout(writes=(2, 1)), Layout(reads=(2, 1))])
+
+
+def test_even_kernels_are_refused() -> None:
+    with pytest.raises(ValueError, match="kernel_size=4 must be odd"):
+        Halving(3, 4, 4)
 
 
 @pytest.mark.parametrize("mode", [torch.inference_mode(), torch.device("meta")], ids=["inference", "meta"])
 def test_where_kernels_are_first_laid_out_does_not_matter(mode: Any) -> None:
-    network, layouts = make_network("stride", 3, 4), [Layout(writes=(2, 1))]
+    network, layouts = make_network("stride", 3, 4), [Layout(reads=(2, 1))]
     halving._make_table.cache_clear()
     with mode:
-        halve(make_images(3).detach(), [network], layouts, torch.tanh)
+        halve(make_images(3).detach(), [network], layouts)
     images = make_images(3)
-    halve(images, [network], layouts, torch.tanh).sum().backward()
+    halve(images, [network], layouts).sum().backward()
     assert images.grad is not None
