@@ -19,6 +19,10 @@ Downsample = Literal["stride", "max_pool"]
 
 Blocks = tuple[int, int]
 """Height and width of blocks [pixels]."""
+Kind = tuple[int, int, int, int]
+"""A layer's outputs, inputs, kernel size, and side of its pools (1 with strides)."""
+Kernels = list[tuple[Tensor, Tensor]]
+"""Weights and biases of each layer of all networks."""
 
 
 class Layout(NamedTuple):
@@ -60,7 +64,7 @@ class Halving(nn.Conv2d):
             raise ValueError(f"kernel_size={kernel_size} must be odd, or the kernel has no middle")
         pool = 2 if downsample == "max_pool" else 1
         super().__init__(in_channels, out_channels, kernel_size, stride=2 // pool, padding=kernel_size // 2)
-        self.pool = pool
+        self.kind: Kind = (out_channels, in_channels, kernel_size, pool)
 
     def forward(self, images: Tensor) -> Tensor:
         """Return images ``[N, O, H / 2, W / 2]`` of images ``[N, C, H, W]``, float."""
@@ -89,7 +93,7 @@ def halve(
     Raises:
         ValueError: if the networks differ, or if blocks do not fit together, the layers' padding or the images.
     """
-    kinds = [tuple((*layer.weight.shape[:3], layer.pool) for layer in network) for network in networks]
+    kinds = [tuple(layer.kind for layer in network) for network in networks]
     if any(kind != kinds[0] for kind in kinds):
         raise ValueError(f"networks that share a pass need the same layers, got {kinds} (outputs, inputs, size, pool)")
     plain = all(layout == PLAIN for layout in layouts)
@@ -129,12 +133,6 @@ def _largest_of_four(images: Tensor, groups: int) -> Tensor:
     wide = images.permute(0, 2, 3, 1).unflatten(3, (groups * 4, -1)).flatten(2, 3).permute(0, 3, 1, 2)
     largest = F.max_pool2d(wide, (1, 4))  # [N, C, H, W * G]
     return largest.permute(0, 2, 3, 1).unflatten(2, (-1, groups)).flatten(3).permute(0, 3, 1, 2)
-
-
-Kernels = list[tuple[Tensor, Tensor]]
-"""Weights and biases of each layer of all networks."""
-Kind = tuple[int, int, int, int]
-"""A layer's outputs, inputs, kernel size and pool."""
 
 
 def _join(networks: Sequence[Sequence[Halving]]) -> Kernels:

@@ -18,7 +18,7 @@ BLOCKS = ((1, 1), (1, 2), (2, 1), (2, 2))
 def plain(images: Tensor, layers: list[Halving]) -> Tensor:
     """Halve images ``[N, C, H, W]`` as the docstrings say, with nothing but PyTorch's functions."""
     for layer in layers:
-        if layer.pool == 1:
+        if layer.stride == (2, 2):
             images = F.conv2d(images, layer.weight, layer.bias, stride=2, padding=2)
         else:
             images = F.max_pool2d(F.conv2d(images, layer.weight, layer.bias, padding=2), 2)
