@@ -64,7 +64,6 @@ class Vision(nn.Module):
             nn.LeakyReLU(LEAK),
             nn.Flatten(),
         )
-        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     @property
     def halvings(self) -> list[Halving]:

@@ -148,7 +148,7 @@ def _lay_out(
     """Return what the convolutions on blocks need, all of it gathered from the layers' parameters in one step."""
     table = _make_table(kinds, len(networks), layouts, size)
     layers = [layer for network in networks for layer in network]
-    flat = [part for layer in layers for part in (layer.weight.permute(0, 2, 3, 1).reshape(-1), layer.bias)]
+    flat = [part for layer in layers for part in (layer.weight.flatten(), layer.bias)]
     parts = torch.cat([flat[0].new_zeros(1), *flat]).index_select(0, table.places).split(table.sizes)
     weights = [part.view(shape).permute(0, 3, 1, 2) for part, shape in zip(parts[::2], table.shapes, strict=True)]
     return list(zip(weights, parts[1::2], strict=True))
@@ -177,7 +177,7 @@ def _make_table(kinds: tuple[Kind, ...], groups: int, layouts: tuple[Layout, ...
         parts, kernels = [], []
         for kind, layout, weights, biases in zip(kinds, layouts, numbers[::2], numbers[1::2], strict=True):
             outputs, inputs, side, pool = kind
-            weights = weights.reshape(groups, outputs, side, side, inputs)
+            weights = weights.reshape(groups, outputs, inputs, side, side).movedim(2, -1)
             kernels.append(_spread(weights, 1 if layout == PLAIN else pool, layout))
             parts += [kernels[-1], biases.repeat(1, len(kernels[-1]) // biases.numel())]
         places = torch.cat([part.flatten() for part in parts])
