@@ -204,13 +204,13 @@ class Algorithm:
         config: the recipe's.
         actions: of its environment.
         variants: ours and its peers.
-        passes: of our update.
+        passes: of our updates, under the names by which they are reported.
     """
 
     config: HindsightConfig
     actions: TensorSpec
     variants: Mapping[str, Variant]
-    passes: Passes
+    passes: Mapping[str, Passes]
 
 
 DRIVE, CHOICE = Bounded(-1.0, 1.0, (2,)), OneHot(4, dtype=torch.int64)
@@ -224,7 +224,7 @@ ALGORITHMS = {
             "torchrl plain loop": partial(torchrl_loop, torchrl_ddpg, torch.contiguous_format),
             "torchrl plain loop, channels_last": partial(torchrl_loop, torchrl_ddpg, torch.channels_last),
         },
-        passes=((2, True), (2, False)),  # actor and critic at s, their targets at s'
+        passes={"our convolutions alone": ((2, True), (2, False))},  # actor and critic at s, their targets at s'
     ),
     "DDQN": Algorithm(
         ddqn_pebble.Config(hindsight="none"),
@@ -236,7 +236,10 @@ ALGORITHMS = {
             "torchrl plain loop": partial(torchrl_loop, torchrl_ddqn, torch.contiguous_format),
             "torchrl plain loop, channels_last": partial(torchrl_loop, torchrl_ddqn, torch.channels_last),
         },
-        passes=((1, True), (2, False)),  # the network at s; with its target at s'
+        passes={
+            "our convolutions alone": ((1, True), (2, False)),  # the network at s; with its target at s'
+            "our convolutions alone, not double": ((1, True), (1, False)),
+        },
     ),
 }
 
@@ -258,8 +261,8 @@ def make_updates(algorithm: Algorithm, rows: TensorDict, **changes: Any) -> dict
     counts = {name: parameters for name, (_, parameters) in made.items()}
     if len(set(counts.values())) != 1:
         raise RuntimeError(f"the networks differ, this would compare apples with pears: {counts}")
-    bound = convolutions(config, rows, algorithm.passes)
-    return {name: run for name, (run, _) in made.items()} | {"our convolutions alone": bound}
+    bounds = {name: convolutions(config, rows, passes) for name, passes in algorithm.passes.items()}
+    return {name: run for name, (run, _) in made.items()} | bounds
 
 
 Case = tuple[str, str, int, str]
