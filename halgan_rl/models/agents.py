@@ -27,7 +27,7 @@ _TALL = (Layout(writes=(2, 1)), Layout(reads=(2, 1), writes=(2, 1)))
 
 
 def _layouts(downsample: Downsample, networks: int, *, learn: bool) -> tuple[Layout, ...]:
-    """Return the layouts of the four layers that took least time, of all that fit, on a core with AVX-512.
+    """Return the layouts of the four layers that took least time of those tried, on a core with AVX-512.
 
     One network alone has half the channels of two, and larger blocks make up for it; three or more were not measured.
     Backward, a stride of 2 costs more than cutting the images into blocks, of which it is a stride of 1.
