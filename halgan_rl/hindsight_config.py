@@ -69,9 +69,9 @@ class HindsightConfig:
 
     epsilon_start: float = 1.0
     """Share of uniformly random actions at the start."""
-    epsilon_end: float = 0.3
+    epsilon_end: float = 0.1
     """Share of uniformly random actions at the end."""
-    epsilon_frames: int = 20_000
+    epsilon_frames: int = 6_000
     """Frames over which the share falls."""
 
     hallucination_start: float = 0.3
