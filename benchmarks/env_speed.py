@@ -5,7 +5,8 @@ Usage: python -m benchmarks.env_speed [--names navigate-2m pebble] [--steps 500]
 Every measurement runs in a process of its own (OpenGL contexts of different kinds do not mix), the variants by turns,
 so that what else the machine does falls on all of them. The table shows medians, by wall time and by processor time,
 which a busy machine distorts less; the ratios are of processor time. MiniWorld's OneRoom, another simulator's room with
-a red box, stands beside navigate-2m, and so does our Gymnasium face, which is its interface.
+a red box, stands beside navigate-2m, and so does our Gymnasium face, which is its interface. Composer environments and
+the TorchRL face are handed actions that were drawn before; TorchRL's rollout and Gymnasium's environments draw theirs.
 """
 
 import argparse
@@ -40,7 +41,20 @@ def composer(name: str, steps: int) -> Callable[[], None]:
 
 
 def torchrl_face(name: str, steps: int) -> Callable[[], None]:
-    """The TorchRL environment: a rollout with TorchRL's random actions, resets included."""
+    """The TorchRL environment with random actions, resets included."""
+    env = envs.make(name, seed=0)
+    actions = [env.action_spec.rand() for _ in range(steps)]
+
+    def run() -> None:
+        state = env.reset()
+        for action in actions:
+            _, state = env.step_and_maybe_reset(state.set("action", action))
+
+    return run
+
+
+def torchrl_rollout(name: str, steps: int) -> Callable[[], None]:
+    """TorchRL's rollout: it draws random actions as well, and stacks all steps."""
     env = envs.make(name, seed=0)
     return lambda: env.rollout(steps, break_when_any_done=False)
 
@@ -79,6 +93,7 @@ VARIANTS = {
     "bare renderer": bare_renderer,
     "ours, composer": composer,
     "ours, TorchRL": torchrl_face,
+    "ours, TorchRL, rollout": torchrl_rollout,
     "stock composer camera": stock_camera,
 }
 ALL_VARIANTS = VARIANTS | {"ours, Gymnasium": gymnasium_face, "MiniWorld OneRoom, Gymnasium": miniworld}
