@@ -29,6 +29,7 @@ def halgan(
     annealing_steps: int = 60_000,
     nearness: float = 1.0,
     tolerance: PoseTolerance = PoseTolerance(),  # noqa: B008 (frozen)
+    least_travel: float = 0.0,
     success_reward: float = 1.0,
     fixed_shape: bool = False,
     pixels_key: NestedKey = "pixels",
@@ -51,6 +52,7 @@ def halgan(
         annealing_steps: Frames from the one share to the other, counted by ``pipeline[1].step(frames)``.
         nearness: Preference for near goals; 1 draws them uniformly, as the paper does.
         tolerance: When a pose is the goal pose.
+        least_travel: Goals nearer than this [m] are not pursued; 0 pursues all, as the paper does.
         success_reward: Added to the reward of a relabelled row that reaches its goal.
         fixed_shape: Whether to hallucinate all rows, so that no shape depends on the data.
         pixels_key: Images uint8 ``[H, W, 3]``.
@@ -84,6 +86,7 @@ def halgan(
             generator=generator,
             nearness=nearness,
             tolerance=tolerance,
+            least_travel=least_travel,
             pose_key=pose_key,
             hindsight_key=hindsight_key,
             goal_key=goal_key,

@@ -217,4 +217,5 @@ def test_the_paper_preset_is_the_papers_table() -> None:
     assert (paper.actor_learning_rate, paper.critic_learning_rate, paper.target_rate) == (1e-5, 1e-4, 1e-3)
     assert (paper.epsilon_start, paper.epsilon_end, paper.epsilon_frames) == (1.0, 0.5, 100_000)
     assert (paper.hallucination_start, paper.hallucination_end, paper.max_distance) == (0.3, 0.0, 32)
+    assert (paper.least_travel, paper.nearness) == (0.0, 1.0)
     assert (paper.discount, paper.noise, paper.clip_targets) == (0.99, 0.1, False)
