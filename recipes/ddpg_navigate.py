@@ -35,7 +35,7 @@ Differences from the paper (Sahni et al., NeurIPS 2019, appendix), all undone by
 7. Goals up to 96 steps ahead instead of 32, but near ones preferred (steps to the goal: uniform squared), so that goals
    are also seen from afar, and three times as many relabelled rows are rewarded.
 8. Epsilon from 1 to 0.1 over 6,000 frames instead of to 0.5 over 100,000; 2,000 warm-up frames, not 10,000. Policies
-   that fail stand in a corner and turn to and fro; they unlearn it sooner the more they act by themselves.
+   that fail mostly stand in a corner and turn to and fro; they unlearn it sooner the more they act by themselves.
 9. Relabelling decays over 60,000 frames instead of 100,000 (which the paper does not state; its epsilon's span).
 10. The shipped generator is this library's (see ``recipes/train_halgan.py``); ``--weights`` takes any other. Its
     output is tabulated once and then looked up (`halgan_rl.hallucination_bank`); ``--no-bank`` asks the generator.
