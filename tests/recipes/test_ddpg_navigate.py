@@ -11,6 +11,8 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from halgan_rl.experiment import make_hindsight
+from halgan_rl.poses import PoseTolerance
 from halgan_rl.presets import parse_config
 from halgan_rl.run_folder import read_metrics
 from recipes import play
@@ -153,6 +155,13 @@ def test_the_saved_policy_plays(halgan_run: Path, tmp_path: Path, capsys: pytest
     play.main(play.Config(run=halgan_run, starts=2, gif=tmp_path / "film.gif"))
     assert "success rate" in capsys.readouterr().out
     assert (tmp_path / "film.gif").stat().st_size > 1000
+
+
+def test_what_a_run_is_told_of_goals_reaches_its_hindsight() -> None:
+    config = dataclasses.replace(TINY, least_travel=0.03, nearness=3.0, goal_distance=0.2, goal_angle=0.4)
+    stamp, draw, _, reward = make_hindsight(config, lambda pixels, pose, goal_pose: pixels)
+    assert (stamp.max_distance, draw.nearness, draw.least_travel) == (32, 3.0, 0.03)
+    assert draw.tolerance == reward.tolerance == PoseTolerance(0.2, 0.4)
 
 
 def test_a_folder_that_holds_a_run_is_refused_first(tmp_path: Path) -> None:
