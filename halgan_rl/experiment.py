@@ -174,7 +174,7 @@ def make_hindsight(config: HindsightConfig, hallucinator: Hallucinator | None) -
         final_probability=config.hallucination_end,
         annealing_steps=config.hallucination_frames,
         tolerance=PoseTolerance(config.goal_distance, config.goal_angle),
-        least_travel=config.least_travel,
+        pursue_unseen=config.pursue_unseen,
         generator=torch.Generator().manual_seed(config.seed),
     )
 

@@ -84,8 +84,8 @@ class HindsightConfig:
     """Longest failed snippet: the goal lies 1 to this many steps ahead."""
     nearness: float = 2.0
     """Preference for near goals: the steps to the goal are uniform to this power; 1 is uniform."""
-    least_travel: float = 0.0
-    """Goals nearer than this [m] are not pursued, whichever way they face; 0 pursues all."""
+    pursue_unseen: bool = False
+    """Pursue hindsight goals that the robot does not see, too."""
     goal_distance: float = 0.01
     """A hindsight goal is reached within this distance [m] ..."""
     goal_angle: float = 0.1
@@ -121,6 +121,7 @@ PAPER: dict[str, Any] = {
     "bank": False,
     "share_latent": False,
     "nearness": 1.0,
+    "pursue_unseen": True,
     "discount": 0.99,
     "downsample": "max_pool",
     "policy_average": 0.0,

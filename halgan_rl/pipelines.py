@@ -29,8 +29,8 @@ def halgan(
     annealing_steps: int = 60_000,
     nearness: float = 1.0,
     tolerance: PoseTolerance = PoseTolerance(),  # noqa: B008 (frozen)
-    least_travel: float = 0.0,
     success_reward: float = 1.0,
+    pursue_unseen: bool = True,
     fixed_shape: bool = False,
     pixels_key: NestedKey = "pixels",
     pose_key: NestedKey = "pose",
@@ -52,8 +52,8 @@ def halgan(
         annealing_steps: Frames from the one share to the other, counted by ``pipeline[1].step(frames)``.
         nearness: Preference for near goals; 1 draws them uniformly, as the paper does.
         tolerance: When a pose is the goal pose.
-        least_travel: Goals nearer than this [m] are not pursued; 0 pursues all, as the paper does.
         success_reward: Added to the reward of a relabelled row that reaches its goal.
+        pursue_unseen: Whether goals are pursued that the image does not show; the paper does not ask.
         fixed_shape: Whether to hallucinate all rows, so that no shape depends on the data.
         pixels_key: Images uint8 ``[H, W, 3]``.
         pose_key: Pose ``[P]``: x [m], y [m], yaw [rad], flags.
@@ -86,7 +86,6 @@ def halgan(
             generator=generator,
             nearness=nearness,
             tolerance=tolerance,
-            least_travel=least_travel,
             pose_key=pose_key,
             hindsight_key=hindsight_key,
             goal_key=goal_key,
@@ -96,6 +95,7 @@ def halgan(
             pixels_key=pixels_key,
             pose_key=pose_key,
             goal_key=goal_key,
+            pursue_unseen=pursue_unseen,
             fixed_shape=fixed_shape,
         ),
         HindsightReward(

@@ -45,8 +45,9 @@ Differences from the paper (Sahni et al., NeurIPS 2019, appendix), all undone by
 12. A moving average of the actor's weights, over some 500 updates, is what is evaluated and saved. The policy that
     explores is the last one: in the 4 m room its success swings (56,000 and 58,000 frames: 88 and 20 %; the average's:
     94 and 86 %).
-13. Goals less than 2 cm away are not pursued: a robot that is stuck in a corner turns to and fro, each of these turns
-    would be a success in hindsight, and the agent would learn to stay there.
+13. Goals that the robot does not see are not pursued. Where an unseen goal is, nothing in the image tells; in hindsight
+    it is where the robot went. So such rows praise going where it always goes, and that may be a corner in which it
+    then stands.
 
 In both rooms the rover has no reverse gear, action -1 is rest and +1 full speed: a random walk that reverses takes half
 of its hindsight goals from behind the robot, where no camera sees them (``envs.make(..., reverse_speed=0.5)`` gives it
@@ -68,8 +69,6 @@ class Config(DDPGConfig):
 
     out: Path = Path("runs/ddpg_navigate")
     """Folder of the run; must not hold one yet."""
-    least_travel: float = 0.02
-    """Goals nearer than this [m] are not pursued, whichever way they face; 0 pursues all."""
 
 
 PRESETS = {
@@ -80,7 +79,6 @@ PRESETS = {
         environment="navigate-4m",
         total_frames=250_000,
         max_distance=32,
-        least_travel=0.0,
         epsilon_frames=100_000,
         hallucination_frames=100_000,
     ),

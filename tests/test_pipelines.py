@@ -185,26 +185,27 @@ def test_options_reach_the_parts() -> None:
         final_probability=0.1,
         annealing_steps=50,
         tolerance=tolerance,
-        least_travel=0.05,
         success_reward=3.0,
+        pursue_unseen=False,
         fixed_shape=True,
     )
     stamp, draw, paint, reward = pipeline
     assert stamp.max_distance == DISTANCE
     assert (draw.probability.item(), draw.final_probability, draw.annealing_steps) == (pytest.approx(0.8), 0.1, 50)
     assert (draw.tolerance, reward.tolerance, reward.success_reward) == (tolerance, tolerance, 3.0)
-    assert draw.least_travel == 0.05
+    assert not paint.pursue_unseen
     assert paint.fixed_shape
 
 
 def test_defaults_are_those_of_the_parts() -> None:
     stamp, draw, paint, reward = pipelines.halgan(invert, generator=random_source())
     alone = DrawHindsightGoal(generator=random_source())
-    for name in ("initial_probability", "final_probability", "annealing_steps", "tolerance", "least_travel"):
+    for name in ("initial_probability", "final_probability", "annealing_steps", "tolerance"):
         assert getattr(draw, name) == getattr(alone, name)
     for part, other in ((stamp, StampFuturePoses()), (paint, HallucinateGoal(invert)), (reward, HindsightReward())):
         for name, value in vars(other).items():
-            if name.endswith("_key") or name in ("max_distance", "fixed_shape", "success_reward", "tolerance"):
+            plain = ("max_distance", "pursue_unseen", "fixed_shape", "success_reward", "tolerance")
+            if name.endswith("_key") or name in plain:
                 assert getattr(part, name) == value
 
 

@@ -1,6 +1,5 @@
 """The first step of the sample path: which rows are relabelled, and to which goal."""
 
-import math
 from typing import Any
 
 import torch
@@ -15,8 +14,8 @@ class DrawHindsightGoal(ReplayTransform):
     """Draws, for each sampled row, whether it is relabelled and which later pose of its episode becomes its goal.
 
     **Core rule.** A row is relabelled with the given probability, towards the pose d steps later, d uniform in
-    1 ... horizon (or nearer, see ``nearness``). It never is if its horizon is 0, if it already stands at the goal
-    drawn, or if that is nearer than ``least_travel``.
+    1 ... horizon (or nearer, see ``nearness``). It never is if its horizon is 0, or if it already stands at the goal
+    drawn.
 
     The probability is annealed linearly, as in :class:`torchrl.modules.EGreedyModule`: call :meth:`step` with the
     number of frames collected. It and the generator's state are part of ``state_dict()``.
@@ -32,16 +31,13 @@ class DrawHindsightGoal(ReplayTransform):
         nearness: Preference k >= 1 for near goals: d is 1 + floor(horizon * u^k), u uniform in [0, 1). 1 is uniform, as
             in the paper; with 2 and a horizon of 32, the next pose is the goal 6 times as often.
         tolerance: When a row already stands at its goal; None relabels such rows too.
-        least_travel: Goals nearer than this [m] are not pursued, whichever way they face. A robot that is stuck turns
-            to and fro, and with 0 each of these turns is a success in hindsight, for which it stays there.
         pose_key: Pose ``[P]`` of the row.
         hindsight_key: Where :class:`~halgan_rl.transforms.StampFuturePoses` wrote ``"pose"`` and ``"horizon"``.
         goal_key: Where ``"mask"`` ``[1]`` bool and ``"pose"`` ``[P]`` are written; the pose means nothing where the
             mask is False.
 
     Raises:
-        ValueError: If a probability is outside [0, 1], ``annealing_steps`` or ``nearness`` is less than 1, or
-            ``least_travel`` is no distance.
+        ValueError: If a probability is outside [0, 1], or ``annealing_steps`` or ``nearness`` is less than 1.
         KeyError: On sampling, if a row lacks a key; names the key and the argument that set it.
 
     Examples:
@@ -66,7 +62,6 @@ class DrawHindsightGoal(ReplayTransform):
         generator: torch.Generator,
         nearness: float = 1.0,
         tolerance: PoseTolerance | None = PoseTolerance(),  # noqa: B008 (frozen)
-        least_travel: float = 0.0,
         pose_key: NestedKey = "pose",
         hindsight_key: NestedKey = "hindsight",
         goal_key: NestedKey = "goal",
@@ -83,11 +78,8 @@ class DrawHindsightGoal(ReplayTransform):
         self.generator = generator
         if not nearness >= 1.0:
             raise ValueError(f"nearness must be at least 1, got {nearness}.")
-        if not 0.0 <= least_travel < math.inf:
-            raise ValueError(f"least_travel must be a distance in metres, 0 or more, got {least_travel}.")
         self.nearness = nearness
         self.tolerance = tolerance
-        self.least_travel = least_travel
         self.pose_key = pose_key
         self.hindsight_key = hindsight_key
         self.goal_key = goal_key
@@ -113,9 +105,6 @@ class DrawHindsightGoal(ReplayTransform):
         mask = (self._uniform(horizon) < self.probability) & (horizon > 0)
         if self.tolerance is not None:
             mask = mask & ~self.tolerance(pose, goal_pose).unsqueeze(-1)
-        if self.least_travel > 0.0:
-            travel = torch.linalg.vector_norm((goal_pose - pose)[..., :2], dim=-1, keepdim=True)
-            mask = mask & (travel >= self.least_travel)
         tensordict.set(unravel_key((self.goal_key, "mask")), mask)
         tensordict.set(unravel_key((self.goal_key, "pose")), goal_pose)
         return tensordict

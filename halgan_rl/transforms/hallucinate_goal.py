@@ -15,12 +15,20 @@ if TYPE_CHECKING:
     from halgan_rl.hallucinators import Hallucinator
 
 
+SEEN = 16
+"""How much some value of an image must change for the goal to be seen; a generator's blur changes less."""
+
+
 class HallucinateGoal(ReplayTransform):
     """Edits the images of relabelled rows so that the goal is seen in them.
 
     **Core rule.** Where ``(goal, "mask")`` is True, the images at t and t+1 are replaced by what the hallucinator makes
     of them, seen from the poses at t and t+1, with the one goal pose; both in one call, so that they show one and the
-    same goal. Other rows stay as they are, bit for bit.
+    same goal. Other rows stay as they are, bit for bit. With ``pursue_unseen=False`` so do those whose image at t does
+    not show the goal, and their mask becomes False.
+
+    A robot that does not see its goal cannot know where it is. In hindsight it always is where the robot went, however
+    often it went there in vain: so rows with unseen goals teach it to go there again, such as into a corner.
 
     Hallucination is costly, so only masked rows are gathered and edited. ``fixed_shape=True`` edits all rows and
     selects by the mask, for CUDA graphs and ``torch.compile``. Both give equal results if a row's hallucination depends
@@ -35,6 +43,8 @@ class HallucinateGoal(ReplayTransform):
         pixels_key: Images uint8 ``[H, W, 3]``, at the root and under ``"next"``.
         pose_key: Poses ``[P]``, at the root and under ``"next"``.
         goal_key: Where :class:`~halgan_rl.transforms.DrawHindsightGoal` wrote ``"mask"`` and ``"pose"``.
+        pursue_unseen: Whether rows stay relabelled whose image at t does not show the goal; the paper does not ask.
+            Seen is a goal for which some value changes by more than ``SEEN`` of 255.
         fixed_shape: Whether to hallucinate all rows, so that no shape depends on the data.
 
     Raises:
@@ -62,6 +72,7 @@ class HallucinateGoal(ReplayTransform):
         pixels_key: NestedKey = "pixels",
         pose_key: NestedKey = "pose",
         goal_key: NestedKey = "goal",
+        pursue_unseen: bool = True,
         fixed_shape: bool = False,
     ) -> None:
         super().__init__()
@@ -71,6 +82,7 @@ class HallucinateGoal(ReplayTransform):
         self.pixels_key = pixels_key
         self.pose_key = pose_key
         self.goal_key = goal_key
+        self.pursue_unseen = pursue_unseen
         self.fixed_shape = fixed_shape
 
     def _edit_rows(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -81,7 +93,8 @@ class HallucinateGoal(ReplayTransform):
         pixels = self._read_both(tensordict, self.pixels_key, "pixels_key")
         edit = self._edit_all if self.fixed_shape else self._edit_masked
         rows = (entry.reshape(-1, *entry.shape[tensordict.batch_dims :]) for entry in (*pixels, *pose, goal_pose))
-        edited = edit(mask.flatten(), *rows)
+        relabelled, *edited = edit(mask.flatten(), *rows)
+        tensordict.set(unravel_key((self.goal_key, "mask")), relabelled.reshape(mask.shape))
         for key, before, after in zip((self.pixels_key, next_key(self.pixels_key)), pixels, edited, strict=True):
             tensordict.set(key, after.reshape(before.shape))
         return tensordict
@@ -90,19 +103,30 @@ class HallucinateGoal(ReplayTransform):
         """Returns an entry at t and at t+1."""
         return self._read(tensordict, key, argument), self._read(tensordict, next_key(key), argument)
 
-    def _edit_masked(self, mask: Tensor, pixels: Tensor, next_pixels: Tensor, *poses: Tensor) -> tuple[Tensor, Tensor]:
-        """Hallucinates the masked ones of N rows only."""
+    def _edit_masked(
+        self, mask: Tensor, pixels: Tensor, next_pixels: Tensor, *poses: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Hallucinates the masked ones of N rows only; returns the mask and both images."""
         index = mask.nonzero().squeeze(-1)
         if len(index) == 0:
-            return pixels, next_pixels
-        root, following = self._hallucinate(*(entry.index_select(0, index) for entry in (pixels, next_pixels, *poses)))
-        return replace_rows(pixels, index, root), replace_rows(next_pixels, index, following)
+            return mask, pixels, next_pixels
+        rows = [entry.index_select(0, index) for entry in (pixels, next_pixels, *poses)]
+        root, following = self._hallucinate(*rows)
+        if not self.pursue_unseen:
+            seen = _differ(rows[0], root).nonzero().squeeze(-1)
+            index, root, following = (entry.index_select(0, seen) for entry in (index, root, following))
+            mask = torch.zeros_like(mask).index_fill(0, index, True)
+        return mask, replace_rows(pixels, index, root), replace_rows(next_pixels, index, following)
 
-    def _edit_all(self, mask: Tensor, pixels: Tensor, next_pixels: Tensor, *poses: Tensor) -> tuple[Tensor, Tensor]:
+    def _edit_all(
+        self, mask: Tensor, pixels: Tensor, next_pixels: Tensor, *poses: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Hallucinates all of N rows, then keeps the masked ones: the same shapes whatever the mask."""
         root, following = self._hallucinate(pixels, next_pixels, *poses)
-        mask = mask[:, None, None, None]
-        return torch.where(mask, root, pixels), torch.where(mask, following, next_pixels)
+        if not self.pursue_unseen:
+            mask = mask & _differ(pixels, root)
+        wide = mask[:, None, None, None]
+        return mask, torch.where(wide, root, pixels), torch.where(wide, following, next_pixels)
 
     def _hallucinate(
         self, pixels: Tensor, next_pixels: Tensor, pose: Tensor, next_pose: Tensor, goal_pose: Tensor
@@ -116,3 +140,8 @@ class HallucinateGoal(ReplayTransform):
                 f"{frames.dtype} {tuple(frames.shape)}, but returned {edited.dtype} {tuple(edited.shape)}."
             )
         return edited[:, 0], edited[:, 1]
+
+
+def _differ(before: Tensor, after: Tensor) -> Tensor:
+    """Tells which images uint8 ``[N, H, W, 3]`` differ by more than ``SEEN``."""
+    return (torch.maximum(before, after) - torch.minimum(before, after)).flatten(1).amax(1) > SEEN

@@ -158,9 +158,9 @@ def test_the_saved_policy_plays(halgan_run: Path, tmp_path: Path, capsys: pytest
 
 
 def test_what_a_run_is_told_of_goals_reaches_its_hindsight() -> None:
-    config = dataclasses.replace(TINY, least_travel=0.03, nearness=3.0, goal_distance=0.2, goal_angle=0.4)
-    stamp, draw, _, reward = make_hindsight(config, lambda pixels, pose, goal_pose: pixels)
-    assert (stamp.max_distance, draw.nearness, draw.least_travel) == (32, 3.0, 0.03)
+    config = dataclasses.replace(TINY, pursue_unseen=True, nearness=3.0, goal_distance=0.2, goal_angle=0.4)
+    stamp, draw, paint, reward = make_hindsight(config, lambda pixels, pose, goal_pose: pixels)
+    assert (stamp.max_distance, draw.nearness, paint.pursue_unseen) == (32, 3.0, True)
     assert draw.tolerance == reward.tolerance == PoseTolerance(0.2, 0.4)
 
 
@@ -226,5 +226,5 @@ def test_the_paper_preset_is_the_papers_table() -> None:
     assert (paper.actor_learning_rate, paper.critic_learning_rate, paper.target_rate) == (1e-5, 1e-4, 1e-3)
     assert (paper.epsilon_start, paper.epsilon_end, paper.epsilon_frames) == (1.0, 0.5, 100_000)
     assert (paper.hallucination_start, paper.hallucination_end, paper.max_distance) == (0.3, 0.0, 32)
-    assert (paper.least_travel, paper.nearness) == (0.0, 1.0)
+    assert (paper.pursue_unseen, paper.nearness) == (True, 1.0)
     assert (paper.discount, paper.noise, paper.clip_targets) == (0.99, 0.1, False)

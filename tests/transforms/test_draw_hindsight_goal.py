@@ -64,22 +64,6 @@ def test_nearness_raises_the_share_of_near_goals(nearness: float) -> None:
     assert (count - expected).abs().max() <= 4 * expected.max().sqrt()
 
 
-def test_goals_nearer_than_the_least_travel_are_not_pursued_however_they_face() -> None:
-    standing = torch.tensor([1.0, -2.0, 0.5])
-    steps = torch.tensor([[0.0, 0.0, 3.0], [0.012, -0.012, 0.0], [0.0, 0.03, 0.0], [-0.015, 0.015, 3.0]])
-    batch = rows(4, horizon=1)
-    batch["pose"] = standing.expand(4, 3)
-    batch["hindsight", "pose"] = (standing + steps)[:, None].expand(4, STEPS, 3)
-    assert draw(least_travel=0.02)(batch.clone())["goal", "mask"].flatten().tolist() == [False, False, True, True]
-    assert draw()(batch)["goal", "mask"].all()
-
-
-@pytest.mark.parametrize("least_travel", [-0.01, float("nan"), float("inf")])
-def test_a_least_travel_that_is_no_distance_is_refused(least_travel: float) -> None:
-    with pytest.raises(ValueError, match="least_travel must be a distance"):
-        draw(least_travel=least_travel)
-
-
 @pytest.mark.parametrize("nearness", [0.5, float("nan")])
 def test_a_preference_for_far_goals_is_refused(nearness: float) -> None:
     with pytest.raises(ValueError, match="nearness must be at least 1"):

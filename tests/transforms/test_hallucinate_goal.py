@@ -56,6 +56,39 @@ def test_only_masked_rows_are_hallucinated_both_frames_in_one_call() -> None:
     assert torch.equal(goal_pose, rows["goal", "pose"][MASKED, None])
 
 
+def paint_by_goal(pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
+    """Brighten one value of frames: by the goal's x in the first frame, and by its y in the second."""
+    painted = pixels.clone()
+    painted[..., 3, 4, 1] = goal_pose[:, 0, :2].to(torch.uint8)
+    return painted
+
+
+@pytest.mark.parametrize("fixed_shape", [False, True])
+def test_a_goal_that_the_first_image_does_not_show_is_given_up_if_asked(fixed_shape: bool) -> None:
+    rows = sampled_rows()
+    rows["pixels"].zero_()
+    rows["next", "pixels"].zero_()
+    rows["goal", "pose"][:, 0], rows["goal", "pose"][:, 1] = 17, 0  # seen, then lost
+    faint, late = MASKED[:3], MASKED[5:6]
+    rows["goal", "pose"][faint, 0] = 16
+    rows["goal", "pose"][late] = torch.tensor([0.0, 255.0, 0.0])  # comes into view
+    out = HallucinateGoal(paint_by_goal, pursue_unseen=False, fixed_shape=fixed_shape)(rows.clone())
+    pursued = [at for at in MASKED if at not in faint + late]
+    assert out["goal", "mask"].flatten().nonzero().flatten().tolist() == pursued
+    assert out["pixels"].flatten(1).any(1).nonzero().flatten().tolist() == pursued
+    assert not out["next", "pixels"].any()
+    asked_for_all = HallucinateGoal(paint_by_goal, fixed_shape=fixed_shape)(rows.clone())
+    assert torch.equal(asked_for_all["goal", "mask"], rows["goal", "mask"])
+    assert asked_for_all["next", "pixels"][late].any()
+
+
+def test_darker_is_seen_as_well_as_brighter() -> None:
+    rows = sampled_rows()
+    rows["pixels"].fill_(255)
+    out = HallucinateGoal(lambda pixels, *_: pixels - 17, pursue_unseen=False)(rows)
+    assert out["goal", "mask"].flatten().nonzero().flatten().tolist() == MASKED
+
+
 def test_nothing_is_hallucinated_when_no_row_is_masked() -> None:
     rows, recorder = sampled_rows(), Recorder()
     rows["goal", "mask"].zero_()
