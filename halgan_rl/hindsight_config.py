@@ -58,7 +58,7 @@ class HindsightConfig:
     """Environment steps collected at a time."""
     discount: float = 0.95
     """Discount factor."""
-    target_rate: float = 2e-2
+    target_rate: float = 1e-1
     """How far the target networks move towards the networks at each update."""
     clip_targets: bool = True
     """Clip the targets of values to [-1, 1]."""
