@@ -5,13 +5,14 @@ from pathlib import Path
 import pytest
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import SamplerWithoutReplacement, SliceSampler
 from torchrl.envs import Compose, SerialEnv
 
 from halgan_rl import pipelines
-from halgan_rl.poses import PoseTolerance
+from halgan_rl.poses import PoseTolerance, relative_pose
 from halgan_rl.transforms import DrawHindsightGoal, HallucinateGoal, HindsightReward, StampFuturePoses
 from tests import toy
 from tests.transforms.rows import RENAMED, assert_identical, invert, leaves, random_source, rename, stamped_by_reference
@@ -85,6 +86,28 @@ def test_a_relabelled_row_shows_and_rewards_its_goal() -> None:
         assert (after["reward"].item(), after["terminated"].item()) == (float(reached), reached)
         assert after["done"].item() == (reached or after["truncated"].item())
     assert sample["next", "terminated"].sum() > 3
+
+
+def paint_what_is_ahead(pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
+    """The exact hallucinator for a car that sees nothing beside it or behind."""
+    ahead = relative_pose(pose, goal_pose)[..., 0] > 0.5
+    return torch.where(ahead[..., None, None, None], toy.hallucinate(pixels, pose, goal_pose), pixels)
+
+
+@pytest.mark.parametrize("fixed_shape", [False, True])
+def test_unseen_goals_leave_no_trace_and_all_seen_ones_are_pursued(fixed_shape: bool) -> None:
+    plain = filled(StampFuturePoses(DISTANCE)).sample(2_000)
+    options = {"max_distance": DISTANCE, "probability": 1.0, "fixed_shape": fixed_shape}
+    drawn, relabelled = (
+        filled(pipelines.halgan(paint_what_is_ahead, generator=random_source(), pursue_unseen=unseen, **options))
+        for unseen in (True, False)
+    )
+    drawn, relabelled = drawn.sample(2_000)["goal"], relabelled.sample(2_000)
+    seen = drawn["mask"] & (relative_pose(plain["pose"], drawn["pose"])[:, :1] > 0.5)
+    assert torch.equal(relabelled["goal", "mask"], seen)
+    assert 200 < seen.sum() < drawn["mask"].sum() - 200
+    assert_identical(relabelled[~seen.flatten()].exclude("goal"), plain[~seen.flatten()])
+    assert relabelled["next", "terminated"][seen].any()
 
 
 def test_rows_from_a_collector_hold_their_own_futures() -> None:
