@@ -34,6 +34,12 @@ def invert(pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
     return 255 - pixels + change[..., None, None, None]
 
 
+def invert_most(pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
+    """The same, but that it shows nothing from the poses of rows 4, 9, ..."""
+    blind = pose[..., 0].round().remainder(5) == 4
+    return torch.where(blind[..., None, None, None], pixels, invert(pixels, pose, goal_pose))
+
+
 def sampled_rows(count: int = 12) -> TensorDict:
     """Rows ``[count]`` as the sample path meets them, each with its index in its pixels, root unlike next in every key.
 
@@ -168,14 +174,23 @@ CASES = {
         },
         ("pixels", ("next", "pixels")),
     ),
-    "HallucinateGoal(fixed_shape)": Case(
-        lambda **keys: HallucinateGoal(invert, fixed_shape=True, **keys),
+    "HallucinateGoal(seen)": Case(
+        lambda **keys: HallucinateGoal(invert_most, pursue_unseen=False, **keys),
         {
             "pixels_key": ("pixels", ("next", "pixels")),
             "pose_key": ("pose", ("next", "pose")),
             "goal_key": (("goal", "mask"), ("goal", "pose")),
         },
-        ("pixels", ("next", "pixels")),
+        ("pixels", ("next", "pixels"), ("goal", "mask")),
+    ),
+    "HallucinateGoal(fixed_shape)": Case(
+        lambda **keys: HallucinateGoal(invert_most, fixed_shape=True, pursue_unseen=False, **keys),
+        {
+            "pixels_key": ("pixels", ("next", "pixels")),
+            "pose_key": ("pose", ("next", "pose")),
+            "goal_key": (("goal", "mask"), ("goal", "pose")),
+        },
+        ("pixels", ("next", "pixels"), ("goal", "mask")),
     ),
     "HindsightReward": Case(
         lambda **keys: HindsightReward(**keys),
