@@ -25,7 +25,7 @@ class DDPGConfig(HindsightConfig):
     """Adam's learning rate for the actor."""
     critic_learning_rate: float = 1e-3
     """Adam's learning rate for the critic."""
-    preactivation_weight: float = 1e-4
+    preactivation_weight: float = 1e-3
     """Price of the square of what goes into the actor's tanh."""
     small_output: bool = True
     """Start the actor's last layer near zero."""

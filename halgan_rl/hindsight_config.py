@@ -58,7 +58,7 @@ class HindsightConfig:
     """Environment steps collected at a time."""
     discount: float = 0.95
     """Discount factor."""
-    target_rate: float = 1e-1
+    target_rate: float = 2e-2
     """How far the target networks move towards the networks at each update."""
     clip_targets: bool = True
     """Clip the targets of values to [-1, 1]."""
@@ -84,7 +84,7 @@ class HindsightConfig:
     """Longest failed snippet: the goal lies 1 to this many steps ahead."""
     nearness: float = 2.0
     """Preference for near goals: the steps to the goal are uniform to this power; 1 is uniform."""
-    pursue_unseen: bool = False
+    pursue_unseen: bool = True
     """Pursue hindsight goals that the robot does not see, too."""
     goal_distance: float = 0.01
     """A hindsight goal is reached within this distance [m] ..."""

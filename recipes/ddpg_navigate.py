@@ -71,6 +71,12 @@ class Config(DDPGConfig):
 
     out: Path = Path("runs/ddpg_navigate")
     """Folder of the run; must not hold one yet."""
+    target_rate: float = 1e-1
+    """How far the target networks move towards the networks at each update."""
+    preactivation_weight: float = 1e-4
+    """Price of the square of what goes into the actor's tanh."""
+    pursue_unseen: bool = False
+    """Pursue hindsight goals that the robot does not see, too."""
 
 
 PRESETS = {

@@ -9,7 +9,7 @@ Usage::
 
 The run's folder and metrics are those of ``ddpg_navigate.py``, but for ``train/loss`` instead of the losses of actor
 and critic. Differences from the paper, all undone by ``--preset paper``: those numbered in ``ddpg_navigate.py`` that
-concern strides, discount, targets, warm-up, the average policy, the bank and unseen goals, and three more:
+concern strides, discount, targets (they follow at 2e-2), warm-up, the average policy and the bank, and three more:
 
 1. Half of the sampled rows are relabelled at first, instead of a fifth; their share decays over 60,000 frames.
 2. Goals up to 32 steps ahead instead of 16, so that the pebble is also seen from afar. (No preference for near ones.)
