@@ -75,9 +75,9 @@ class HindsightConfig:
     """Frames over which the share falls."""
 
     hallucination_start: float = 0.3
-    """Probability that a sampled row is relabelled, at the start."""
+    """Probability that a goal is drawn for a sampled row, at the start."""
     hallucination_end: float = 0.0
-    """Probability that a sampled row is relabelled, at the end."""
+    """Probability that a goal is drawn for a sampled row, at the end."""
     hallucination_frames: int = 60_000
     """Frames over which the probability falls."""
     max_distance: int = 96
@@ -85,7 +85,7 @@ class HindsightConfig:
     nearness: float = 2.0
     """Preference for near goals: the steps to the goal are uniform to this power; 1 is uniform."""
     pursue_unseen: bool = True
-    """Pursue hindsight goals that the robot does not see, too."""
+    """Also pursue hindsight goals that the image does not show."""
     goal_distance: float = 0.01
     """A hindsight goal is reached within this distance [m] ..."""
     goal_angle: float = 0.1

@@ -47,13 +47,13 @@ def halgan(
         hallucinator: Paints the goal into the images: a trained GAN, or anything that keeps the protocol.
         generator: Draws which rows are relabelled, and their goals.
         max_distance: Furthest goal, in steps.
-        probability: Share of sampled rows to relabel at first, in [0, 1].
+        probability: Share of sampled rows for which a goal is drawn at first, in [0, 1].
         final_probability: That share after ``annealing_steps`` frames.
         annealing_steps: Frames from the one share to the other, counted by ``pipeline[1].step(frames)``.
         nearness: Preference for near goals; 1 draws them uniformly, as the paper does.
         tolerance: When a pose is the goal pose.
         success_reward: Added to the reward of a relabelled row that reaches its goal.
-        pursue_unseen: Whether goals are pursued that the image does not show; the paper does not ask.
+        pursue_unseen: Whether goals are pursued that the image does not show, as in the paper.
         fixed_shape: Whether to hallucinate all rows, so that no shape depends on the data.
         pixels_key: Images uint8 ``[H, W, 3]``.
         pose_key: Pose ``[P]``: x [m], y [m], yaw [rad], flags.

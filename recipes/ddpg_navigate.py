@@ -33,9 +33,9 @@ Differences from the paper (Sahni et al., NeurIPS 2019, appendix), all undone by
    faster. With 2e-2 a robot that had come to stand still or to dither did so for thousands of frames.
 5. Targets clipped to [-1, 1], the range of any return.
 6. A price on the square of the actor's pre-activations: without it the tanh saturates within 500 updates, everywhere.
-   It is small: 1e-3 instead of 1e-4 is more than what a turn is worth that may bring the box into view.
+   It is 1e-4: 1e-3 outweighs what a turn is worth that may bring the box into view.
 7. Goals up to 96 steps ahead instead of 32, but near ones preferred (steps to the goal: uniform squared), so that goals
-   are also seen from afar, and three times as many relabelled rows are rewarded.
+   are also seen from afar, and more of the relabelled rows are rewarded.
 8. Epsilon from 1 to 0.1 over 6,000 frames instead of to 0.5 over 100,000; 2,000 warm-up frames, not 10,000. Policies
    that fail mostly stand in a corner and turn to and fro; they unlearn it sooner the more they act by themselves.
 9. Relabelling decays over 60,000 frames instead of 100,000 (which the paper does not state; its epsilon's span).
@@ -47,9 +47,9 @@ Differences from the paper (Sahni et al., NeurIPS 2019, appendix), all undone by
 12. A moving average of the actor's weights, over some 500 updates, is what is evaluated and saved. The policy that
     explores is the last one: in the 4 m room its success swings (56,000 and 58,000 frames: 88 and 20 %; the average's:
     94 and 86 %).
-13. Goals that the robot does not see are not pursued. Where an unseen goal is, nothing in the image tells; in hindsight
-    it is where the robot went. So such rows praise going where it always goes, and that may be a corner in which it
-    then stands.
+13. Goals that the image does not show are not pursued. Where an unseen goal is, nothing in the image tells; in
+    hindsight it is where the robot went. So such rows praise going where it always goes, and that may be a corner in
+    which it then stands.
 
 In both rooms the rover has no reverse gear, action -1 is rest and +1 full speed: a random walk that reverses takes half
 of its hindsight goals from behind the robot, where no camera sees them (``envs.make(..., reverse_speed=0.5)`` gives it
@@ -76,7 +76,7 @@ class Config(DDPGConfig):
     preactivation_weight: float = 1e-4
     """Price of the square of what goes into the actor's tanh."""
     pursue_unseen: bool = False
-    """Pursue hindsight goals that the robot does not see, too."""
+    """Also pursue hindsight goals that the image does not show."""
 
 
 PRESETS = {

@@ -15,8 +15,8 @@ the green box. The run's folder and metrics are those of ``ddpg_navigate.py``, a
 ``eval/held``                   share of the fixed starts in which the red box was picked up
 ==============================  ====================================================================
 
-Differences from the paper, besides those numbered in ``ddpg_navigate.py`` (but for 13; the target rate of 4 is 2e-2
-here, the price of 6 is 1e-3), all undone by ``--preset paper``:
+Differences from the paper, besides those numbered in ``ddpg_navigate.py`` (but not 13; and with target rate 2e-2 in
+4 and price 1e-3 in 6), all undone by ``--preset paper``:
 
 1. Which box is painted, the row's ``held`` flag tells. (The authors draw it at random.)
 2. One update every 2 frames instead of every frame.

@@ -40,7 +40,7 @@ class Config(DDQNConfig):
     out: Path = Path("runs/ddqn_pebble")
     """Folder of the run; must not hold one yet."""
     hallucination_start: float = 0.5
-    """Probability that a sampled row is relabelled, at the start."""
+    """Probability that a goal is drawn for a sampled row, at the start."""
     max_distance: int = 32
     """Longest failed snippet: the goal lies 1 to this many steps ahead."""
     nearness: float = 1.0

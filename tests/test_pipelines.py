@@ -225,10 +225,10 @@ def test_defaults_are_those_of_the_parts() -> None:
     alone = DrawHindsightGoal(generator=random_source())
     for name in ("initial_probability", "final_probability", "annealing_steps", "tolerance"):
         assert getattr(draw, name) == getattr(alone, name)
+    names = ("max_distance", "pursue_unseen", "fixed_shape", "success_reward", "tolerance")
     for part, other in ((stamp, StampFuturePoses()), (paint, HallucinateGoal(invert)), (reward, HindsightReward())):
         for name, value in vars(other).items():
-            plain = ("max_distance", "pursue_unseen", "fixed_shape", "success_reward", "tolerance")
-            if name.endswith("_key") or name in plain:
+            if name.endswith("_key") or name in names:
                 assert getattr(part, name) == value
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 SEEN = 16
-"""How much some value of an image must change for the goal to be seen; a generator's blur changes less."""
+"""How much some value of an image must change for the goal to be seen; shipped generators' blur seldom changes more."""
 
 
 class HallucinateGoal(ReplayTransform):
@@ -27,8 +27,8 @@ class HallucinateGoal(ReplayTransform):
     same goal. Other rows stay as they are, bit for bit. With ``pursue_unseen=False`` so do those whose image at t does
     not show the goal, and their mask becomes False.
 
-    A robot that does not see its goal cannot know where it is. In hindsight it always is where the robot went, however
-    often it went there in vain: so rows with unseen goals teach it to go there again, such as into a corner.
+    A robot that does not see its goal cannot know where it is. In hindsight the goal always lies where the robot went,
+    however often it went there in vain: so rows with unseen goals teach it to go there again, such as into a corner.
 
     Hallucination is costly, so only masked rows are gathered and edited. ``fixed_shape=True`` edits all rows and
     selects by the mask, for CUDA graphs and ``torch.compile``. Both give equal results if a row's hallucination depends
@@ -43,8 +43,8 @@ class HallucinateGoal(ReplayTransform):
         pixels_key: Images uint8 ``[H, W, 3]``, at the root and under ``"next"``.
         pose_key: Poses ``[P]``, at the root and under ``"next"``.
         goal_key: Where :class:`~halgan_rl.transforms.DrawHindsightGoal` wrote ``"mask"`` and ``"pose"``.
-        pursue_unseen: Whether rows stay relabelled whose image at t does not show the goal; the paper does not ask.
-            Seen is a goal for which some value changes by more than ``SEEN`` of 255.
+        pursue_unseen: Whether rows stay relabelled whose image at t does not show the goal, as in the paper. Seen is a
+            goal for which some value changes by more than ``SEEN`` of 255, so not one of its background's colour.
         fixed_shape: Whether to hallucinate all rows, so that no shape depends on the data.
 
     Raises:

@@ -158,9 +158,9 @@ def test_the_saved_policy_plays(halgan_run: Path, tmp_path: Path, capsys: pytest
 
 
 def test_what_a_run_is_told_of_goals_reaches_its_hindsight() -> None:
-    config = dataclasses.replace(TINY, pursue_unseen=True, nearness=3.0, goal_distance=0.2, goal_angle=0.4)
+    config = dataclasses.replace(TINY, nearness=3.0, goal_distance=0.2, goal_angle=0.4)
     stamp, draw, paint, reward = make_hindsight(config, lambda pixels, pose, goal_pose: pixels)
-    assert (stamp.max_distance, draw.nearness, paint.pursue_unseen) == (32, 3.0, True)
+    assert (stamp.max_distance, draw.nearness, paint.pursue_unseen) == (32, 3.0, False)
     assert draw.tolerance == reward.tolerance == PoseTolerance(0.2, 0.4)
 
 
@@ -210,6 +210,7 @@ def test_values_that_cannot_work_are_refused(changes: dict[str, float]) -> None:
 
 def test_the_preset_chooses_the_defaults_and_flags_win() -> None:
     assert parse_config(PRESETS, [], description=None) == PRESETS["default"]
+    assert not PRESETS["default"].pursue_unseen
     assert parse_config(PRESETS, ["--preset", "paper"], description=None) == PRESETS["paper"]
     config = parse_config(PRESETS, ["--preset", "paper", "--batch-size", "16"], description=None)
     assert config == dataclasses.replace(PRESETS["paper"], batch_size=16)

@@ -82,11 +82,12 @@ def test_a_goal_that_the_first_image_does_not_show_is_given_up_if_asked(fixed_sh
     assert asked_for_all["next", "pixels"][late].any()
 
 
-def test_darker_is_seen_as_well_as_brighter() -> None:
+@pytest.mark.parametrize(("darker", "seen"), [(17, MASKED), (16, []), (1, [])])
+def test_darker_is_seen_as_well_as_brighter(darker: int, seen: list[int]) -> None:
     rows = sampled_rows()
-    rows["pixels"].fill_(255)
-    out = HallucinateGoal(lambda pixels, *_: pixels - 17, pursue_unseen=False)(rows)
-    assert out["goal", "mask"].flatten().nonzero().flatten().tolist() == MASKED
+    rows["pixels"].fill_(200)
+    out = HallucinateGoal(lambda pixels, *_: pixels - darker, pursue_unseen=False)(rows)
+    assert out["goal", "mask"].flatten().nonzero().flatten().tolist() == seen
 
 
 def test_nothing_is_hallucinated_when_no_row_is_masked() -> None:
