@@ -164,16 +164,37 @@ def make_ddpg_updates(rows: TensorDict, config: HindsightConfig, rate: float) ->
     return partial(model.train, batch_size=config.batch_size), _counts(model.actor, model.critic)
 
 
-def make_dqn_updates(rows: TensorDict, config: HindsightConfig, rate: float) -> tuple[Updates, tuple[int, ...]]:
+class DoubleTarget(nn.Module):
+    """What a target network says of the actions that the network itself prefers.
+
+    Takes the place of the target network: the largest of its values, of which there is one a frame, is then the target
+    of double DQN.
+    """
+
+    def __init__(self, network: nn.Module, target: nn.Module) -> None:
+        super().__init__()
+        self.network, self.target = network, target
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """Return values ``[N, 1]``."""
+        return self.target(observations).gather(1, self.network(observations).argmax(1, keepdim=True))
+
+
+def make_dqn_updates(
+    rows: TensorDict, config: HindsightConfig, rate: float, *, double: bool
+) -> tuple[Updates, tuple[int, ...]]:
     """Return updates of DQN and of its target, and the number of parameters; the rows' actions are one-hot."""
     choices = spaces.Discrete(rows["action"].shape[-1])
     rows = rows.clone(False).set("action", rows["action"].argmax(-1, keepdim=True))
     model = make_model(DQN, choices, rows, config, rate)
+    target = model.q_net_target
+    if double:
+        model.q_net_target = DoubleTarget(model.q_net, target)
 
     def run(count: int) -> None:
         for _ in range(count):
             model.train(gradient_steps=1, batch_size=config.batch_size)
-            polyak_update(model.q_net.parameters(), model.q_net_target.parameters(), model.tau)
+            polyak_update(model.q_net.parameters(), target.parameters(), model.tau)
 
     return run, _counts(model.q_net)
 

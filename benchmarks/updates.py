@@ -14,8 +14,9 @@ TorchRL's in ``channels_last`` as well. The numbers of parameters are compared b
 processor time in alternating rounds.
 
 Stable-Baselines3's DQN is not double: it does not ask the online network about next frames, one forward pass less. So
-ours is measured without that pass as well, and compared with that. Its ``train`` leaves the target network to the steps
-in the environment; here the target network follows at each update, as in the others.
+both it and ours are measured twice: double, for which its target network is wrapped in one that asks, and not double.
+Its ``train`` leaves the target network to the steps in the environment; here the target network follows at each update,
+as in the others.
 
 "Our convolutions alone" are the passes of our update, forward and, where they learn, backward, from the images on:
 what it would take if all else (sampling, heads, losses, Adam, targets) cost nothing.
@@ -185,9 +186,9 @@ def sb3_ddpg(config: ddpg.DDPGConfig, rows: TensorDict) -> tuple[Updates, Counts
     return sb3_peers.make_ddpg_updates(rows, config, config.critic_learning_rate)
 
 
-def sb3_dqn(config: ddqn.DDQNConfig, rows: TensorDict) -> tuple[Updates, Counts]:
-    """Return Stable-Baselines3's updates, not double, and the numbers of parameters."""
-    return sb3_peers.make_dqn_updates(rows, config, config.learning_rate)
+def sb3_dqn(config: ddqn.DDQNConfig, rows: TensorDict, *, double: bool) -> tuple[Updates, Counts]:
+    """Return Stable-Baselines3's updates, and the numbers of parameters."""
+    return sb3_peers.make_dqn_updates(rows, config, config.learning_rate, double=double)
 
 
 def count_parameters(loss: LossModule) -> Counts:
@@ -232,7 +233,8 @@ ALGORITHMS = {
         {
             "ours": partial(ours, ddqn.make_agent, CHOICE),
             "ours, not double": partial(ours, make_single_dqn, CHOICE),
-            "SB3 DQN.train, not double": sb3_dqn,
+            "SB3 DQN.train, made double": partial(sb3_dqn, double=True),
+            "SB3 DQN.train, not double": partial(sb3_dqn, double=False),
             "torchrl plain loop": partial(torchrl_loop, torchrl_ddqn, torch.contiguous_format),
             "torchrl plain loop, channels_last": partial(torchrl_loop, torchrl_ddqn, torch.channels_last),
         },

@@ -3,6 +3,7 @@ import json
 
 import pytest
 import torch
+from torch import nn
 
 pytest.importorskip("stable_baselines3", reason="the peers live in an environment of their own: make bench")
 
@@ -16,6 +17,17 @@ from halgan_rl.models import agents
 from halgan_rl.models.halving import halve
 
 TINY = replay.Benchmark(rounds=1, calls=1)
+
+
+class Constant(nn.Module):
+    """Gives the same values whatever it sees."""
+
+    def __init__(self, values):
+        super().__init__()
+        self.values = values
+
+    def forward(self, observations):
+        return self.values[: len(observations)]
 
 
 def test_frames_are_shared_by_neighbours_and_by_no_other_rows():
@@ -72,6 +84,34 @@ def test_a_double_update_asks_a_network_once_more(make_agent, passes, monkeypatc
     monkeypatch.setattr(agents, "halve", spy)
     run(1)
     assert len(asked) == passes
+
+
+def test_a_peers_target_made_double_values_what_the_network_chooses():
+    chooses, values = torch.tensor([[0.0, 2.0, 1.0], [5.0, 2.0, 1.0]]), torch.tensor([[3.0, 4.0, 9.0], [6.0, 7.0, 8.0]])
+    target = sb3_peers.DoubleTarget(*(Constant(each) for each in (chooses, values)))
+    assert target(torch.zeros(2, 3, 64, 64)).max(1).values.tolist() == [4.0, 6.0]
+
+
+@pytest.mark.parametrize(("double", "asked"), [(True, 2), (False, 1)])
+def test_a_peers_target_network_follows_and_is_double_if_asked(double, asked, monkeypatch):
+    config = dataclasses.replace(updates.ALGORITHMS["DDQN"].config, batch_size=4)
+    rows = Rows(64).take(EPISODE)
+    rows["action"] = updates.CHOICE.rand((EPISODE,))
+    followed, seen = [], []
+    monkeypatch.setattr(sb3_peers, "polyak_update", lambda *pairs: followed.append([list(each) for each in pairs[:2]]))
+    forward = sb3_peers.Features.forward
+
+    def spy(self, observations):
+        seen.append(torch.is_grad_enabled())
+        return forward(self, observations)
+
+    monkeypatch.setattr(sb3_peers.Features, "forward", spy)
+    run, (parameters,) = sb3_peers.make_dqn_updates(rows, config, 1e-3, double=double)
+    run(1)
+    assert sorted(seen) == [False] * asked + [True]  # at s', and at s
+    ((sources, targets),) = followed
+    assert sum(target.numel() for target in targets) == parameters
+    assert not {id(source) for source in sources} & {id(target) for target in targets}
 
 
 def test_the_cost_of_hindsight_is_measured_on_the_recipes_update():
