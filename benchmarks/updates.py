@@ -18,8 +18,9 @@ both it and ours are measured twice: double, for which its target network is wra
 Its ``train`` leaves the target network to the steps in the environment; here the target network follows at each update,
 as in the others.
 
-"Our convolutions alone" are the passes of our update, forward and, where they learn, backward, from the images on:
-what it would take if all else (sampling, heads, losses, Adam, targets) cost nothing.
+"Our convolutions alone" are the passes of our update, forward and, where they learn, backward, from the images on, with
+all that serves them (images become floats, pixels and kernels are laid out in blocks): what an update would take if all
+else (sampling, heads, losses, Adam, targets) cost nothing.
 """
 
 import dataclasses
