@@ -1,9 +1,6 @@
 """A replay storage that keeps each frame once."""
 
-import json
 import logging
-import os
-import shutil
 from collections.abc import Sequence
 from functools import partial, reduce
 from multiprocessing.context import get_spawning_popen
@@ -13,14 +10,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.data import LazyTensorStorage
-from torchrl.data.replay_buffers.checkpointers import StorageCheckpointerBase
 
+from halgan_rl.frame_checkpointer import FrameStorageCheckpointer
 from halgan_rl.frame_table import OVERHEAD, FrameTable, FrameTableFullError, gather
+from halgan_rl.free_room import check_room, readable
 from halgan_rl.transforms.base import dotted, next_key
 
 _LOGGER = logging.getLogger(__name__)
@@ -32,51 +28,6 @@ CHUNK = 1_024
 
 Places = int | slice | range | Sequence[int] | Tensor
 """Which rows: a number, or what indexes the first dimension of a tensor."""
-
-
-class FrameStorageCheckpointer(StorageCheckpointerBase):
-    """Keeps a :class:`FrameStorage` in a safetensors file: numbers only, nothing is ever unpickled."""
-
-    FILE = "frame_storage.safetensors"
-
-    def dumps(self, storage: "FrameStorage", path: str | Path) -> None:
-        """Writes the rows into the folder ``path``; a reader never meets a partial file."""
-        self._refuse_hooks()
-        state = TensorDict.from_dict(storage.state_dict(), batch_size=[])
-        tensors = {json.dumps(key): value for key, value in state.items(True, True)}
-        target = Path(path, self.FILE)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        partial = target.with_name(f"{self.FILE}.partial")
-        try:
-            save_file(tensors, partial)
-            os.replace(partial, target)
-        finally:
-            partial.unlink(missing_ok=True)
-
-    def loads(self, storage: "FrameStorage", path: str | Path) -> None:
-        """Restores what :meth:`dumps` wrote.
-
-        Raises:
-            FileNotFoundError: if the folder holds no such file.
-            ValueError: if the file is damaged, or does not fit the storage.
-        """
-        self._refuse_hooks()
-        source = Path(path, self.FILE)
-        if not source.is_file():
-            raise FileNotFoundError(f"no checkpoint of a FrameStorage at {source}: check the path")
-        try:
-            tensors = load_file(source)
-        except SafetensorError as error:
-            raise ValueError(f"{source} is damaged ({error}): copy it again") from error
-        state = TensorDict(batch_size=[])
-        for name, value in tensors.items():
-            key = json.loads(name)
-            state.set(key if isinstance(key, str) else tuple(key), value)
-        storage.load_state_dict(state.to_dict())
-
-    def _refuse_hooks(self) -> None:
-        if self._save_hooks or self._load_hooks:
-            raise ValueError("FrameStorage knows no hooks on saving and loading: do not register any")
 
 
 class FrameStorage(LazyTensorStorage):
@@ -311,8 +262,8 @@ class FrameStorage(LazyTensorStorage):
         bytes_per_row = entries + 2 * torch.int64.itemsize + size + OVERHEAD
         nbytes = self.max_size * bytes_per_row + self.extra_frames * (size + OVERHEAD)
         remedy = f"max_size={self.max_size} rows of {bytes_per_row} bytes, extra_frames={self.extra_frames}"
-        _LOGGER.info("FrameStorage takes %s: %s", _readable(nbytes), remedy)
-        _check_room(nbytes, slots * OVERHEAD, self.scratch_dir, remedy)
+        _LOGGER.info("FrameStorage takes %s: %s", readable(nbytes), remedy)
+        check_room(nbytes, slots * OVERHEAD, self.scratch_dir, remedy)
         if self.scratch_dir is None:
             # NumPy asks the system for huge pages: random reads are a tenth faster than from PyTorch's memory, though
             # the first writing is slower.
@@ -416,7 +367,7 @@ class FrameStorage(LazyTensorStorage):
     def __repr__(self) -> str:
         return (
             f"{type(self).__name__}({len(self)} of max_size={self.max_size} rows, {self.frames_kept} frames, "
-            f"extra_frames={self.extra_frames}, {_readable(self.nbytes)})"
+            f"extra_frames={self.extra_frames}, {readable(self.nbytes)})"
         )
 
     def __getstate__(self) -> dict[str, Any]:
@@ -461,38 +412,3 @@ def _share_memory(one: Tensor, other: Tensor) -> bool:
 
 def _names(keys: Any) -> str:
     return ", ".join(sorted(map(dotted, keys))) or "nothing"
-
-
-def _readable(size: float) -> str:
-    """A size for people."""
-    for unit in ("bytes", "kB", "MB"):
-        if size < 1000:
-            return f"{size:.4g} {unit}"
-        size /= 1000
-    return f"{size:.4g} GB"
-
-
-def _check_room(nbytes: int, bookkeeping: int, scratch_dir: Path | None, remedy: str) -> None:
-    """Refuses sizes [bytes] that free memory or, with a ``scratch_dir``, its free disk cannot hold."""
-    needs = [("memory", nbytes, _free_memory())]
-    if scratch_dir is not None:
-        scratch_dir.mkdir(parents=True, exist_ok=True)
-        needs = [
-            ("memory", bookkeeping, _free_memory()),
-            (f"the disk of {scratch_dir}", nbytes - bookkeeping, shutil.disk_usage(scratch_dir).free),
-        ]
-    for where, needed, free in needs:
-        if needed > free:
-            raise MemoryError(
-                f"FrameStorage needs {_readable(needed)} ({needed} bytes) in {where}, {_readable(free)} ({free} bytes) "
-                f"are free: choose fewer than {remedy}, or another scratch_dir"
-            )
-
-
-def _free_memory() -> int:
-    """Memory that can be had without swapping [bytes]."""
-    meminfo = Path("/proc/meminfo")
-    for line in meminfo.read_text().splitlines() if meminfo.exists() else ():
-        if line.startswith("MemAvailable:"):
-            return 1024 * int(line.split()[1])
-    return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")

@@ -25,7 +25,7 @@ from torchrl.data import (
 )
 from torchrl.data.replay_buffers import RandomSampler, SamplerWithoutReplacement, SliceSampler
 
-from halgan_rl import frame_storage
+from halgan_rl import frame_checkpointer, frame_storage, free_room
 from halgan_rl.frame_storage import FrameStorage
 from halgan_rl.frame_table import OVERHEAD
 from halgan_rl.transforms import StampFuturePoses
@@ -499,7 +499,7 @@ def test_a_failed_checkpoint_leaves_the_last_one(tmp_path: Path, monkeypatch: py
         raise OSError("no space left")
 
     storage.set([0], episode(1, first=600))
-    monkeypatch.setattr(frame_storage, "save_file", fail)
+    monkeypatch.setattr(frame_checkpointer, "save_file", fail)
     with pytest.raises(OSError, match="no space left"):
         storage.dumps(tmp_path)
     assert len(list(tmp_path.iterdir())) == 1
@@ -564,7 +564,7 @@ def test_by_default_a_tenth_more_frames_than_rows(max_size: int, extra: int) -> 
 def test_the_size_is_logged_before_anything_is_allocated(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(frame_storage, "_free_memory", lambda: 0)
+    monkeypatch.setattr(free_room, "free_memory", lambda: 0)
     storage = FrameStorage(1_000, extra_frames=50)
     with caplog.at_level(logging.INFO), pytest.raises(MemoryError):
         storage.set(range(3), episode(3))
@@ -575,7 +575,7 @@ def test_the_size_is_logged_before_anything_is_allocated(
 
 def test_too_little_memory_is_refused_with_the_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     storage = FrameStorage(1_000, extra_frames=50)
-    monkeypatch.setattr(frame_storage, "_free_memory", lambda: 12_345)
+    monkeypatch.setattr(free_room, "free_memory", lambda: 12_345)
     with pytest.raises(MemoryError, match=r"\(\d{6} bytes\) in memory.*\(12345 bytes\) are free.*max_size=1000 rows"):
         storage.set(range(3), episode(3))
     assert (len(storage), storage.initialized) == (0, False)
@@ -594,16 +594,16 @@ def test_too_little_disk_is_refused_with_the_numbers(tmp_path: Path, monkeypatch
 
 def test_mapped_rows_need_little_memory_but_their_bookkeeping(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     storage = FrameStorage(1_000, extra_frames=50, scratch_dir=tmp_path)
-    monkeypatch.setattr(frame_storage, "_free_memory", lambda: 1_050 * OVERHEAD)
+    monkeypatch.setattr(free_room, "free_memory", lambda: 1_050 * OVERHEAD)
     storage.set(range(3), episode(3))
-    monkeypatch.setattr(frame_storage, "_free_memory", lambda: 1_050 * OVERHEAD - 1)
+    monkeypatch.setattr(free_room, "free_memory", lambda: 1_050 * OVERHEAD - 1)
     with pytest.raises(MemoryError, match="in memory"):
         FrameStorage(1_000, extra_frames=50, scratch_dir=tmp_path).set(range(3), episode(3))
 
 
 def test_free_memory_is_that_of_this_machine() -> None:
     total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    assert 0.001 * total < frame_storage._free_memory() < total
+    assert 0.001 * total < free_room.free_memory() < total
 
 
 def test_mapped_files_are_gone_at_once_but_their_rows_are_not(tmp_path: Path) -> None:
