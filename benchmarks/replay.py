@@ -13,8 +13,9 @@ transitions one by one, which is their API for one environment; the others 16 at
 
 A peer and ours, at all sizes, are measured by turns on one thread. Times are medians of processor time. Samples are
 timed after a few that are not, for all buffers alike: the first of a round finds cold caches, whatever the buffer, and
-would draw all ratios to 1. What a sample takes right after rows were added has a column of its own. A million rows are
-measured with frames of 8x8 pixels, to fit; the same small frames show how time grows from ten thousand rows on.
+would draw all ratios to 1. What a sample takes right after rows were added has a column of its own, and so has one of
+sixteen that are drawn at once, as in our recipes (``halgan_rl.training.draw_batches``). A million rows are measured
+with frames of 8x8 pixels, to fit; the same small frames show how time grows from ten thousand rows on.
 """
 
 import dataclasses
@@ -38,6 +39,7 @@ from benchmarks.rounds import alternate, seconds_a_call, warm_heap
 from benchmarks.rows import EPISODE, Rows, plain
 from benchmarks.tables import Table, report
 from halgan_rl.frame_storage import FrameStorage
+from halgan_rl.training import AT_ONCE
 from halgan_rl.transforms import DrawHindsightGoal, HindsightReward, StampFuturePoses
 
 ADDED, PAIRS = 16, 32
@@ -66,7 +68,7 @@ class Replay:
         rows: what to fill it with, and to go on with.
         prepare: brings rows into the form that ``add`` takes; not timed.
         add: writes what was prepared.
-        sample: draws 32 pairs.
+        sample: draws so many pairs.
         row_bytes: memory it asks for, a row [bytes].
         resident_bytes: memory that it was seen to take, a row [bytes].
     """
@@ -74,7 +76,7 @@ class Replay:
     rows: Rows
     prepare: Callable[[TensorDict], Any]
     add: Callable[[Any], object]
-    sample: Callable[[], object]
+    sample: Callable[[int], object]
     row_bytes: float
     resident_bytes: float = 0.0
 
@@ -90,8 +92,13 @@ class Replay:
     def time_sample(self, calls: int) -> float:
         """Return the time of a sample [s] when others went before."""
         for _ in range(UNTIMED):
-            self.sample()
-        return seconds_a_call(self.sample, calls)
+            self.sample(PAIRS)
+        return seconds_a_call(partial(self.sample, PAIRS), calls)
+
+    def time_sample_at_once(self, calls: int) -> float:
+        """Return the time of a sample [s] when as many are drawn at once as our recipes draw."""
+        self.sample(AT_ONCE * PAIRS)
+        return seconds_a_call(partial(self.sample, AT_ONCE * PAIRS), 1 + calls // AT_ONCE) / AT_ONCE
 
     def time_sample_after_add(self, calls: int) -> float:
         """Return the time of the first sample after adding rows [s]."""
@@ -99,7 +106,7 @@ class Replay:
         for rows in self.prepared(calls):
             self.add(rows)
             started = time.process_time()
-            self.sample()
+            self.sample(PAIRS)
             seconds += time.process_time() - started
         return seconds / calls
 
@@ -138,7 +145,7 @@ def on_sb3(buffer: sb3_peers.ReplayBuffer, rows: Rows, count: int, *, goals: boo
         rows=rows,
         prepare=partial(sb3_peers.transitions, goals=goals),
         add=partial(sb3_peers.add, buffer),
-        sample=partial(buffer.sample, PAIRS),
+        sample=buffer.sample,
         row_bytes=sb3_peers.nbytes(buffer) / count,
     )
 
@@ -207,10 +214,16 @@ COMPARISONS: dict[tuple[str, Maker], dict[str, Maker]] = {
     },
     ("ours, hindsight", ours_with_hindsight): {"SB3 HerReplayBuffer": sb3_her, "torchrl HERReplayBuffer": torchrl_her},
 }
-MEASURES = {"add": Replay.time_add, "sample": Replay.time_sample, "after add": Replay.time_sample_after_add}
+MEASURES = {
+    "add": Replay.time_add,
+    "sample": Replay.time_sample,
+    "after add": Replay.time_sample_after_add,
+    "at once": Replay.time_sample_at_once,
+}
 HEADER = (
     *("frames", "rows", "buffer", "add 16 [µs]", "ours / it", "sample 32 [µs]", "ours / it"),
-    *("right after an add [µs]", "ours / it", "bytes a row", "of them resident", "growth of sampling, after an add"),
+    *("right after an add [µs]", "ours / it", "one of 16 at once [µs]", "ours / it"),
+    *("bytes a row", "of them resident", "growth of sampling, after an add"),
 )
 
 
