@@ -8,7 +8,7 @@ import pytest
 import envs
 
 ROOT = Path(__file__).parents[1]
-README, CONTRIBUTING = ROOT / "README.md", ROOT / "CONTRIBUTING.md"
+README, CONTRIBUTING, RESULTS = ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "results" / "README.md"
 
 
 def run_examples(document: Path) -> list[dict]:
@@ -36,7 +36,15 @@ def test_the_task_that_contributing_adds_can_be_solved_and_gives_near_goal_frame
     assert (box[..., 2] - box[..., 0] > 80).sum() > 20  # something blue is ahead
 
 
-def test_every_file_that_is_linked_exists() -> None:
-    links = re.findall(r"\]\(([^)#:]+)\)", README.read_text())
+@pytest.mark.parametrize("document", [README, RESULTS], ids=["README", "results"])
+def test_every_file_and_heading_that_is_linked_exists(document: Path) -> None:
+    links = re.findall(r"\]\(([^):]+)\)", document.read_text())
     assert links
-    assert [link for link in links if not (README.parent / link).exists()] == []
+    assert [link for link in links if not is_there(document.parent, *link.partition("#")[::2])] == []
+
+
+def is_there(folder: Path, path: str, heading: str) -> bool:
+    if not heading:
+        return (folder / path).exists()
+    headings = re.findall(r"^#+ (.*)$", (folder / path).read_text(), re.MULTILINE)
+    return heading in {re.sub(r"[^\w\- ]", "", each).lower().replace(" ", "-") for each in headings}
