@@ -11,15 +11,17 @@ time limits are not told from terminations), and TorchRL's own ``LazyTensorStora
 both, which relabel 80 % of a sample, as ours does here. The two of Stable-Baselines3 get images channels first and
 transitions one by one, which is their API for one environment; the others 16 at once.
 
-A peer and ours, at all sizes, are measured by turns on one thread. Times are medians of processor time. Samples are
-timed after a few that are not, for all buffers alike: the first of a round finds cold caches, whatever the buffer, and
-would draw all ratios to 1. What a sample takes right after rows were added has a column of its own, and so has one of
-sixteen that are drawn at once, as in our recipes (``halgan_rl.training.draw_batches``). A million rows are measured
-with frames of 8x8 pixels, to fit; the same small frames show how time grows from ten thousand rows on.
+A peer and ours, at all sizes, are measured by turns on one thread. Times are medians of processor time, ratios
+medians of those of each round. Samples are timed after a few that are not, for all buffers alike: the first of a
+round finds cold caches, whatever the buffer, and would draw all ratios to 1. What a sample takes right after rows
+were added has a column of its own, and so has one of sixteen that are drawn at once, as in our recipes
+(``halgan_rl.training.draw_batches``). A million rows are measured with frames of 8x8 pixels, to fit; the same small
+frames show how time grows from ten thousand rows on.
 """
 
 import dataclasses
 import gc
+import statistics
 import time
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -35,7 +37,7 @@ from torchrl.data import HERReplayBuffer, LazyTensorStorage, TensorDictReplayBuf
 from torchrl.envs import Compose
 
 from benchmarks import sb3_peers
-from benchmarks.rounds import alternate, seconds_a_call, warm_heap
+from benchmarks.rounds import ratio, seconds_a_call, take_turns, warm_heap
 from benchmarks.rows import EPISODE, Rows, plain
 from benchmarks.tables import Table, report
 from halgan_rl.frame_storage import FrameStorage
@@ -265,18 +267,18 @@ def compare(side: int, sizes: tuple[int, ...], benchmark: Benchmark) -> list[lis
     return sorted(cells, key=lambda line: int(line[1].replace(",", "")))
 
 
-Times = dict[tuple[str, str, int], float]
+Times = dict[tuple[str, str, int], list[float]]
 
 
 def measure(buffers: dict[str, dict[int, Replay]], benchmark: Benchmark) -> Times:
-    """Return medians [s] by measure, buffer and rows, all taken by turns."""
+    """Return times [s] by measure, buffer and rows, all taken by turns."""
     measures = {
         (measure, name, count): partial(timed, replay, benchmark.calls)
         for measure, timed in MEASURES.items()
         for name, replays in buffers.items()
         for count, replay in replays.items()
     }
-    return alternate(measures, benchmark.rounds)
+    return take_turns(measures, benchmark.rounds)
 
 
 def describe(side: int, buffers: dict[str, dict[int, Replay]], times: Times, own_name: str) -> Iterable[list[str]]:
@@ -287,9 +289,10 @@ def describe(side: int, buffers: dict[str, dict[int, Replay]], times: Times, own
             line = [f"{side}x{side}", f"{count:,}", name]
             for measure in MEASURES:
                 own, value = times[measure, own_name, count], times[measure, name, count]
-                line += [f"{value * 1e6:,.0f}", f"{own / value:.2f}"]
+                line += [f"{statistics.median(value) * 1e6:,.0f}", f"{ratio(own, value):.2f}"]
             growth = (
-                times[measure, name, count] / times[measure, name, smallest] for measure in ("sample", "after add")
+                ratio(times[measure, name, count], times[measure, name, smallest])
+                for measure in ("sample", "after add")
             )
             taken = f"{replay.resident_bytes:,.0f}" if count * replay.row_bytes > LARGE else "-"
             line += [f"{replay.row_bytes:,.0f}", taken, " ".join(f"{g:.2f}" for g in growth)]

@@ -2,7 +2,7 @@
 
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
 
 import torch
@@ -37,6 +37,6 @@ def take_turns(measures: Mapping[Name, Callable[[], Value]], rounds: int) -> dic
     return {name: measured[1:] for name, measured in values.items()}
 
 
-def alternate(measures: Mapping[Name, Callable[[], float]], rounds: int) -> dict[Name, float]:
-    """Take each measure by turns, see :func:`take_turns`; return the medians."""
-    return {name: statistics.median(values) for name, values in take_turns(measures, rounds).items()}
+def ratio(values: Sequence[float], others: Sequence[float]) -> float:
+    """Return the median of the rounds' ratios: a spell in which the machine is slow falls on both sides of each."""
+    return statistics.median(value / other for value, other in zip(values, others, strict=True))

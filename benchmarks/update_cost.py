@@ -13,6 +13,7 @@ ratios, machines are noisy.
 """
 
 import dataclasses
+import statistics
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -24,7 +25,7 @@ from torch import Tensor
 from torchrl.data import Bounded
 
 import envs
-from benchmarks.rounds import alternate, seconds_a_call, warm_heap
+from benchmarks.rounds import ratio, seconds_a_call, take_turns, warm_heap
 from benchmarks.tables import Table, report
 from halgan_rl.ddpg import make_agent
 from halgan_rl.experiment import make_buffer, make_hallucinator, make_hindsight
@@ -92,13 +93,18 @@ def main(benchmark: Benchmark) -> None:
             hallucinator = make_hallucinator(dataclasses.replace(config, **changes), envs)
             updates[f"{name}, {share:.1%} drawn"] = make_updates(config, rollout, hallucinator, benchmark.updates)
     measures = {name: partial(seconds_a_call, run, 1) for name, run in updates.items()}
-    seconds = {name: value / benchmark.updates for name, value in alternate(measures, benchmark.rounds).items()}
+    seconds = take_turns(measures, benchmark.rounds)
     title = (
         f"Hallucination in a DDPG update, batch {default.batch_size}, one thread, medians of {benchmark.rounds} "
-        f"alternating rounds of {benchmark.updates}, processor time."
+        f"alternating rounds of {benchmark.updates}, processor time; ratios are medians of those of each round."
     )
     lines = [
-        [name, f"{value * 1e3:.1f}", f"{1 - seconds['none'] / value:.1%}", f"{value / seconds['none']:.2f}"]
+        [
+            name,
+            f"{statistics.median(value) / benchmark.updates * 1e3:.1f}",
+            f"{1 - ratio(seconds['none'], value):.1%}",
+            f"{ratio(value, seconds['none']):.2f}",
+        ]
         for name, value in seconds.items()
     ]
     report("update_cost", [Table(title, ("painter", "ms an update", "share of it", "ratio to none"), lines)])

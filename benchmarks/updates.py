@@ -10,8 +10,8 @@ fused Adam. Stable-Baselines3's is ``DDPG.train``, with all gradient steps of a 
 convolutions as features extractor, in DDPG one for each of actor and critic (it has one learning rate for both).
 TorchRL's is ``DDPGLoss`` or ``DQNLoss``, an Adam for each network and ``SoftUpdate`` on a ``LazyTensorStorage`` of
 images channels first. Peers have networks of plain layers that compute the same, in PyTorch's default memory format;
-TorchRL's in ``channels_last`` as well. The numbers of parameters are compared before measuring. One thread, medians of
-processor time in alternating rounds.
+TorchRL's in ``channels_last`` as well. The numbers of parameters are compared before measuring. One thread, processor
+time in alternating rounds: medians, and medians of the rounds' ratios.
 
 Stable-Baselines3's DQN is not double: it does not ask the online network about next frames, one forward pass less. So
 both it and ours are measured twice: double, for which its target network is wrapped in one that asks, and not double.
@@ -25,6 +25,7 @@ else (sampling, heads, losses, Adam, targets) cost nothing.
 
 import dataclasses
 import itertools
+import statistics
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -40,7 +41,7 @@ from torchrl.objectives import DDPGLoss, DQNLoss, LossModule, SoftUpdate, ValueE
 
 from benchmarks import sb3_peers
 from benchmarks.plain_vision import PlainVision
-from benchmarks.rounds import alternate, seconds_a_call, warm_heap
+from benchmarks.rounds import ratio, seconds_a_call, take_turns, warm_heap
 from benchmarks.rows import Rows, channels_first, plain
 from benchmarks.tables import Table, report
 from halgan_rl import ddpg, ddqn
@@ -63,7 +64,7 @@ Variant = Callable[[Any, TensorDict], tuple[Updates, Counts]]
 class Benchmark:
     """Updates a second, side by side."""
 
-    rounds: int = 7
+    rounds: int = 11
     """Alternating rounds; the median is reported."""
     updates: int = 8
     """Updates a round."""
@@ -272,8 +273,8 @@ Case = tuple[str, str, int, str]
 """Algorithm, down-sampling, batch size, variant."""
 
 
-def measure(benchmark: Benchmark) -> dict[Case, float]:
-    """Return medians of the time of an update [s], all taken by turns."""
+def measure(benchmark: Benchmark) -> dict[Case, list[float]]:
+    """Return times of some updates [s], all taken by turns."""
     rows = Rows(64).take(benchmark.rows)
     measures = {}
     for (algorithm, made), *options in itertools.product(
@@ -282,12 +283,18 @@ def measure(benchmark: Benchmark) -> dict[Case, float]:
         downsample, size = options
         for name, run in make_updates(made, rows, batch_size=size, downsample=downsample).items():
             measures[algorithm, downsample, size, name] = partial(seconds_a_call, partial(run, benchmark.updates), 1)
-    return {case: value / benchmark.updates for case, value in alternate(measures, benchmark.rounds).items()}
+    return take_turns(measures, benchmark.rounds)
 
 
 def our(name: str) -> str:
     """Return which of our variants another one is compared with."""
     return "ours, not double" if name.endswith("not double") else "ours"
+
+
+def describe(seconds: list[float], updates: int) -> tuple[str, str]:
+    """Return the time of an update [ms], and updates a second, of some rounds' times [s]."""
+    median = statistics.median(seconds)
+    return f"{1e3 * median / updates:.1f}", f"{updates / median:.0f}"
 
 
 HEADER = (
@@ -305,12 +312,13 @@ def main(benchmark: Benchmark) -> None:
     seconds = measure(benchmark)
     title = (
         f"Updates, one thread, medians of {benchmark.rounds} alternating rounds of {benchmark.updates}, processor "
-        "time. The factors tell how many times as fast ours is: with the same networks, and with strides."
+        "time. The factors, medians of those of each round, tell how many times as fast ours is: with the same "
+        "networks, and with strides."
     )
     lines = [
-        [algorithm, downsample, str(size), name, f"{value * 1e3:.1f}", f"{1 / value:.0f}"]
+        [algorithm, downsample, str(size), name, *describe(value, benchmark.updates)]
         + [
-            f"{value / seconds[algorithm, other, size, our(name)]:.2f}"
+            f"{ratio(value, seconds[algorithm, other, size, our(name)]):.2f}"
             for other in (downsample, benchmark.downsamples[0])
         ]
         for (algorithm, downsample, size, name), value in seconds.items()

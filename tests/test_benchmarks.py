@@ -7,7 +7,7 @@ import torch
 pytest.importorskip("stable_baselines3", reason="the peers live in an environment of their own: make bench")
 
 from benchmarks import replay, sb3_peers, update_cost, updates
-from benchmarks.rounds import alternate
+from benchmarks.rounds import ratio, take_turns
 from benchmarks.rows import EPISODE, Rows, channels_first, plain
 from benchmarks.tables import Table, report
 from halgan_rl import ddqn
@@ -111,8 +111,14 @@ def test_rounds_alternate_and_the_first_does_not_count():
     order = []
     values = {"a": iter([9.0, 1.0, 2.0, 6.0]), "b": iter([0.0, 3.0, 4.0, 5.0])}
     measures = {name: lambda name=name: order.append(name) or next(values[name]) for name in values}
-    assert alternate(measures, rounds=3) == {"a": 2.0, "b": 4.0}
+    assert take_turns(measures, rounds=3) == {"a": [1.0, 2.0, 6.0], "b": [3.0, 4.0, 5.0]}
     assert order == ["a", "b"] * 4
+
+
+def test_a_ratio_is_the_median_of_the_rounds_not_the_ratio_of_medians():
+    assert ratio([1.0, 20.0, 3.0], [2.0, 10.0, 1.0]) == 2.0
+    with pytest.raises(ValueError, match="shorter"):
+        ratio([1.0, 2.0], [1.0])
 
 
 def test_a_saved_table_names_versions_but_no_machine(tmp_path, capsys):
