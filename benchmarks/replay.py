@@ -56,7 +56,7 @@ SIZES = {64: (10_000, 100_000), 8: (10_000, 100_000, 1_000_000)}
 class Benchmark:
     """Replay buffers side by side."""
 
-    rounds: int = 9
+    rounds: int = 21
     """Alternating rounds; medians are reported."""
     calls: int = 25
     """Calls a round."""
