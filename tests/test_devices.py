@@ -16,6 +16,7 @@ from halgan_rl import ddpg, ddqn
 from halgan_rl.experiment import check_device
 from halgan_rl.hindsight_config import HindsightConfig
 from recipes import ddpg_navigate, ddqn_pebble
+from tests.recipes import without_pictures
 from tests.recipes.test_ddpg_navigate import TINY
 
 ALGORITHMS: dict[str, tuple[Any, HindsightConfig, TensorSpec]] = {
@@ -70,7 +71,8 @@ def test_acting_on_a_copy_changes_nothing(tmp_path: Path, monkeypatch: pytest.Mo
     for name in ("itself", "copy"):
         if name == "copy":
             monkeypatch.setattr(ddpg, "on_cpu", copy.deepcopy)
-        ddpg_navigate.main(dataclasses.replace(config, out=tmp_path / name))
+        with without_pictures():
+            ddpg_navigate.main(dataclasses.replace(config, out=tmp_path / name))
         policies.append(load_file(tmp_path / name / "policy.safetensors"))
     assert all(torch.equal(value, policies[1][name]) for name, value in policies[0].items())
 

@@ -17,6 +17,7 @@ from halgan_rl.presets import parse_config
 from halgan_rl.run_folder import read_metrics
 from recipes import play
 from recipes.ddpg_navigate import PRESETS, Config, main
+from tests.recipes import without_pictures
 
 TINY = dataclasses.replace(
     Config(),
@@ -34,8 +35,9 @@ TINY = dataclasses.replace(
 
 
 def run(out: Path, **changes: object) -> dict[str, torch.Tensor]:
-    """Run the recipe; return the policy that it saved."""
-    main(dataclasses.replace(TINY, out=out, **changes))
+    """Run the recipe, but for its pictures; return the policy that it saved."""
+    with without_pictures():
+        main(dataclasses.replace(TINY, out=out, **changes))
     return load_file(out / "policy.safetensors")
 
 
@@ -47,7 +49,7 @@ def differ(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> set[
 @pytest.fixture(scope="module")
 def halgan_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "halgan"
-    run(out)
+    main(dataclasses.replace(TINY, out=out))
     return out
 
 

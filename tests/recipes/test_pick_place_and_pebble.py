@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from halgan_rl.hindsight_config import HindsightConfig
 from halgan_rl.presets import parse_config
 from halgan_rl.run_folder import read_metrics
 from recipes import ddpg_pick_place, ddqn_pebble, play
+from tests.recipes import without_pictures
 
 TINY = {
     "total_frames": 96,
@@ -39,8 +41,9 @@ def run(request: pytest.FixtureRequest) -> Run:
     """Runs one of the recipes into a folder."""
     config, main = RECIPES[request.param]
 
-    def run(out: Path, **changes: Any) -> Path:
-        main(dataclasses.replace(config, **(TINY | changes), out=out))
+    def run(out: Path, *, pictures: bool = False, **changes: Any) -> Path:
+        with nullcontext() if pictures else without_pictures():
+            main(dataclasses.replace(config, **(TINY | changes), out=out))
         return out
 
     return run
@@ -48,7 +51,7 @@ def run(request: pytest.FixtureRequest) -> Run:
 
 @pytest.fixture(scope="module")
 def halgan_run(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return run(tmp_path_factory.mktemp("runs") / "halgan")
+    return run(tmp_path_factory.mktemp("runs") / "halgan", pictures=True)
 
 
 def policy(folder: Path) -> dict[str, torch.Tensor]:
@@ -69,14 +72,16 @@ def test_a_run_repeats_itself_bit_for_bit_and_another_method_does_not(
     assert not any(torch.equal(first[name], none[name]) for name in first)
 
 
-def test_the_saved_policy_plays(halgan_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_pictures_are_drawn_and_the_saved_policy_plays(halgan_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert {path.name for path in halgan_run.iterdir()} >= {"agent.gif", "curve.png", "hallucinations.png"}
     play.main(play.Config(run=halgan_run, starts=1))
     assert "success rate" in capsys.readouterr().out
 
 
 def test_the_share_of_pick_ups_is_reported(tmp_path: Path) -> None:
     config = dataclasses.replace(ddpg_pick_place.Config(), **TINY, hindsight="none", out=tmp_path / "run")
-    ddpg_pick_place.main(config)
+    with without_pictures():
+        ddpg_pick_place.main(config)
     assert read_metrics(tmp_path / "run" / "metrics.csv")["eval/held"] == [0, 0]
 
 
