@@ -19,6 +19,7 @@ _SMALL = 3e-3
 """Bound on what the actor's last layer starts from (Lillicrap et al., "Continuous control with deep reinforcement
 learning", 2016, section 7)."""
 _ACTIVATION = partial(nn.functional.leaky_relu, negative_slope=LEAK, inplace=True)
+"""In place: no gradient needs what a convolution, or a pool, gave before it."""
 
 _SQUARE = (Layout(writes=(2, 2)), Layout(reads=(2, 2), writes=(2, 1)))
 """The first two layers of one network."""
