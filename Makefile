@@ -33,20 +33,20 @@ bench: $(BENCH_VENV)/ready  ## speed and memory side by side with the peers, in 
 
 weights: $(VENV)/ready  ## train the shipped generators again (a few minutes)
 	for environment in navigate-2m navigate-4m pick-and-place-2m pebble; do \
-	  run=runs/weights-$$environment shipped=halgan_rl/shipped/$$environment; \
+	  run=runs/weights-$$environment shipped=halgan_rl/hallucination/shipped/$$environment; \
 	  test $$environment = pebble && noise=0.05 || noise=0.7; \
 	  $(BIN)/python recipes/train_halgan.py --environment $$environment --seed 0 --latent-noise $$noise --out $$run && \
 	  cp $$run/generator.safetensors $$shipped.safetensors && \
 	  cp $$run/generator.json $$shipped.json && \
 	  cp $$run/hallucinations.png $$shipped.png || exit 1; done
 
-$(VENV)/ready: pyproject.toml constraints.txt
+$(VENV)/ready: pyproject.toml setup.py constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@
 
-$(BENCH_VENV)/ready: pyproject.toml constraints.txt benchmarks/requirements-peers.txt
+$(BENCH_VENV)/ready: pyproject.toml setup.py constraints.txt benchmarks/requirements-peers.txt
 	$(PYTHON) -m venv $(BENCH_VENV)
 	$(BENCH_VENV)/bin/python -m pip install --quiet --constraint constraints.txt torch
 	$(BENCH_VENV)/bin/python -m pip install --quiet --constraint constraints.txt --requirement benchmarks/requirements-peers.txt --editable .

@@ -19,30 +19,30 @@ from collections.abc import Callable
 from functools import partial
 
 import gymnasium
+import halgan_envs
 import numpy as np
 import torch
+from halgan_envs.adapters.transition import random_action
+from halgan_envs.environment import Environment
 
-import envs
 from benchmarks.tables import Table, report
-from envs.environment import Environment
-from envs.transition import random_action
 
 
 def bare_renderer(name: str, steps: int) -> Callable[[], None]:
     """The camera alone: no step of any environment can be faster."""
-    environment = envs.named(name)(random_state=0)
+    environment = halgan_envs.named(name)(random_state=0)
     environment.reset()
     return lambda: repeat(steps, lambda: environment.task.robot.camera.render(environment.physics))
 
 
 def composer(name: str, steps: int) -> Callable[[], None]:
     """Our composer environment with random actions, resets included."""
-    return stepping(envs.named(name)(random_state=0), steps)
+    return stepping(halgan_envs.named(name)(random_state=0), steps)
 
 
 def torchrl_face(name: str, steps: int) -> Callable[[], None]:
     """The TorchRL environment with random actions, resets included."""
-    env = envs.make(name, seed=0)
+    env = halgan_envs.make(name, seed=0)
     actions = [env.action_spec.rand() for _ in range(steps)]
 
     def run() -> None:
@@ -55,7 +55,7 @@ def torchrl_face(name: str, steps: int) -> Callable[[], None]:
 
 def torchrl_rollout(name: str, steps: int) -> Callable[[], None]:
     """TorchRL's rollout: it draws random actions as well, and stacks all steps."""
-    env = envs.make(name, seed=0)
+    env = halgan_envs.make(name, seed=0)
     return lambda: env.rollout(steps, break_when_any_done=False)
 
 
@@ -63,7 +63,7 @@ def stock_camera(name: str, steps: int) -> Callable[[], None]:
     """The same task and scene with dm_control's own camera observable."""
     from dm_control.composer.observation import observable
 
-    environment = envs.named(name)(random_state=0)
+    environment = halgan_envs.named(name)(random_state=0)
     task = environment.task
     stock = observable.MJCFCamera(task.robot.mjcf_model.find("camera", "egocentric"), height=64, width=64)
     stock.enabled = True
@@ -74,7 +74,7 @@ def stock_camera(name: str, steps: int) -> Callable[[], None]:
 
 def gymnasium_face(name: str, steps: int) -> Callable[[], None]:
     """The Gymnasium environment, with random actions."""
-    return stepping_gymnasium(gymnasium.make(envs.gymnasium_id(name)), steps)
+    return stepping_gymnasium(gymnasium.make(halgan_envs.gymnasium_id(name)), steps)
 
 
 def miniworld(name: str, steps: int) -> Callable[[], None]:
@@ -148,7 +148,9 @@ def measure_elsewhere(variant: str, name: str, steps: int) -> tuple[float, float
 def main() -> None:
     """Reads the command line and prints a table, or one number for ``--variant``."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--names", nargs="+", default=TASKS, choices=sorted(envs.NAMES), help="which environments")
+    parser.add_argument(
+        "--names", nargs="+", default=TASKS, choices=sorted(halgan_envs.NAMES), help="which environments"
+    )
     parser.add_argument("--steps", default=500, type=int, help="steps a measurement")
     parser.add_argument("--rounds", default=5, type=int, help="measurements a variant")
     parser.add_argument("--variant", choices=ALL_VARIANTS, help="measure only this one, in the first of them, here")
@@ -171,7 +173,7 @@ def make_table(name: str, results: dict[str, list[tuple[float, float]]]) -> Tabl
     """Return medians, spread, and the ratio to the stock camera."""
     wall = {variant: [value[0] for value in values] for variant, values in results.items()}
     processor = {variant: statistics.median(value[1] for value in values) for variant, values in results.items()}
-    title = f"{name}, 64x64 pixels, {envs.gl_backend.VARIABLE}={envs.fingerprint(name)['gl']}, one process"
+    title = f"{name}, 64x64 pixels, {halgan_envs.rendering.gl_backend.VARIABLE}={halgan_envs.fingerprint(name)['gl']}, one process"
     header = ("variant", "steps/s", "lowest to highest", "steps per processor second", "ratio to stock")
     lines = []
     for variant, values in wall.items():

@@ -19,7 +19,7 @@ import torch
 import tyro
 
 from benchmarks.tables import Table, report
-from halgan_rl.run_folder import check_unused, read_metrics
+from halgan_rl.experiment.run_folder import check_unused, read_metrics
 from recipes import ddpg_navigate, evaluate_halgan, train_halgan
 
 HEADER = (

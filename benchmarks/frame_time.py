@@ -4,7 +4,7 @@ Usage::
 
     python -m benchmarks.frame_time
 
-Runs the loop of ``halgan_rl.training`` on the parts that ``halgan_rl.experiment`` makes for a recipe's default
+Runs the loop of ``halgan_rl.training.loop`` on the parts that ``halgan_rl.experiment.run`` makes for a recipe's default
 configuration, past the warm-up, and times each part without those within it: rendering is not counted as physics.
 Collecting, all together, bounds what collecting at the same time as learning could save. The loop's own part is the
 moving average of the weights, and the figures; files and pictures are left out. One thread, medians of processor time
@@ -25,16 +25,17 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import halgan_envs
 import torch
 import tyro
+from halgan_envs.adapters.torchrl_env import ComposerEnv
 from torchrl.data import TensorDictReplayBuffer
 
-import envs
 from benchmarks.rounds import take_turns, warm_heap
 from benchmarks.tables import Table, report
-from envs.torchrl_env import ComposerEnv
-from halgan_rl.evaluation_process import evaluate_at_once
-from halgan_rl.experiment import (
+from halgan_rl.experiment.config import HindsightConfig
+from halgan_rl.experiment.metrics import Report
+from halgan_rl.experiment.run import (
     EVALUATION_SEED,
     make_buffer,
     make_collector,
@@ -42,9 +43,8 @@ from halgan_rl.experiment import (
     make_hallucinator,
     make_hindsight,
 )
-from halgan_rl.hindsight_config import HindsightConfig
-from halgan_rl.metrics import Report
-from halgan_rl.training import Agent, Schedule, train
+from halgan_rl.training.evaluation_process import evaluate_at_once
+from halgan_rl.training.loop import Agent, Schedule, train
 from recipes import ddpg_navigate, ddpg_pick_place, ddqn_pebble
 
 RECIPES = {
@@ -148,12 +148,12 @@ def make_round(recipe: Any, benchmark: Benchmark, out: Path, **changes: Any) -> 
     config: HindsightConfig = dataclasses.replace(
         recipe.PRESETS["default"], warmup_frames=benchmark.rows, total_frames=ENDLESS, out=out, **changes
     )
-    hallucinator = make_hallucinator(config, envs)
-    env, evaluation_env = envs.make(config.environment, seed=config.seed), envs.make(config.environment)
+    hallucinator = make_hallucinator(config, halgan_envs)
+    env, evaluation_env = halgan_envs.make(config.environment, seed=config.seed), halgan_envs.make(config.environment)
     agent = recipe.make_agent(config, env.action_spec)
     hindsight = make_hindsight(config, hallucinator)
     buffer = make_buffer(config, hindsight)
-    collector = iter(make_collector(config, envs, env, agent.explorer))
+    collector = iter(make_collector(config, halgan_envs, env, agent.explorer))
     while len(buffer) < benchmark.rows:
         buffer.extend(next(collector))
 

@@ -21,7 +21,7 @@ import tyro
 from matplotlib.figure import Figure
 
 from benchmarks.tables import Table, report
-from halgan_rl.run_folder import read_metrics
+from halgan_rl.experiment.run_folder import read_metrics
 from recipes import train_halgan
 
 GAME = {"warm_start_steps": 0, "iterations": 1_000_000, "evaluate_every": 50}

@@ -23,7 +23,7 @@ import tyro
 
 from benchmarks.frame_time import RECIPES
 from benchmarks.tables import Table, report
-from halgan_rl.run_folder import read_metrics
+from halgan_rl.experiment.run_folder import read_metrics
 
 WAYS: dict[str, dict[str, bool]] = {
     "all in one process": {"background_evaluation": False, "background_collection": False},

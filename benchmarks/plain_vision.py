@@ -3,12 +3,12 @@
 import torch
 from torch import Tensor, nn
 
-from halgan_rl.models.halgan import LEAK
-from halgan_rl.models.halving import Downsample
+from halgan_rl.agents.fast_cpu.block_convolutions import Downsample
+from halgan_rl.hallucination.generators.paper import LEAK
 
 
 class PlainVision(nn.Module):
-    """The function of :class:`halgan_rl.models.agents.Vision` in plain layers.
+    """The function of :class:`halgan_rl.agents.networks.Vision` in plain layers.
 
     Like there, max-pooling comes before the LeakyReLU: the other way round costs more and gives the same.
 

@@ -15,7 +15,7 @@ A peer and ours, at all sizes, are measured by turns on one thread. Times are me
 medians of those of each round. Samples are timed after a few that are not, for all buffers alike: the first of a
 round finds cold caches, whatever the buffer, and would draw all ratios to 1. What a sample takes right after rows
 were added has a column of its own, and so has one of sixteen that are drawn at once, as in our recipes
-(``halgan_rl.training.draw_batches``). A million rows are measured with frames of 8x8 pixels, to fit; the same small
+(``halgan_rl.training.loop.draw_batches``). A million rows are measured with frames of 8x8 pixels, to fit; the same small
 frames show how time grows from ten thousand rows on.
 """
 
@@ -40,8 +40,8 @@ from benchmarks import sb3_peers
 from benchmarks.rounds import ratio, seconds_a_call, take_turns, warm_heap
 from benchmarks.rows import EPISODE, Rows, plain
 from benchmarks.tables import Table, report
-from halgan_rl.frame_storage import FrameStorage
-from halgan_rl.training import AT_ONCE
+from halgan_rl.replay.frame_storage import FrameStorage
+from halgan_rl.training.loop import AT_ONCE
 from halgan_rl.transforms import DrawHindsightGoal, HindsightReward, StampFuturePoses
 
 ADDED, PAIRS = 16, 32

@@ -20,8 +20,8 @@ from torch import Tensor, nn
 
 from benchmarks.plain_vision import PlainVision
 from benchmarks.rows import EPISODE, channels_first
-from halgan_rl.hindsight_config import HindsightConfig
-from halgan_rl.models.halgan import LEAK
+from halgan_rl.experiment.config import HindsightConfig
+from halgan_rl.hallucination.generators.paper import LEAK
 
 ACTIONS = spaces.Box(-1, 1, (2,), np.float32)
 POSES = spaces.Box(-np.inf, np.inf, (3,), np.float32)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from halgan_rl.run_folder import versions
+from halgan_rl.experiment.run_folder import versions
 
 RESULTS = Path(__file__).parent / "results"
 

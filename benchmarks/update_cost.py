@@ -5,7 +5,7 @@ Usage::
     python -m benchmarks.update_cost   # the recipe's batch
 
 Times updates of the recipe (sample, loss, backward, both optimizer steps, target update), sampled sixteen at once as in
-a training (:func:`halgan_rl.training.draw_batches`), with no hindsight, with goals that are drawn and rewarded but not
+a training (:func:`halgan_rl.training.loop.draw_batches`), with no hindsight, with goals that are drawn and rewarded but not
 painted, with HALGAN looked up in the bank, with its generator itself and with the simulator as oracle, at the share of
 rows for which the recipe draws a goal at the start and at its mean over a run. All of them are painted; about half show
 nothing of their goal and are not relabelled in the end. Medians of processor time in alternating rounds; quote the
@@ -18,19 +18,19 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import halgan_envs
 import torch
 import tyro
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import Bounded
 
-import envs
 from benchmarks.rounds import ratio, seconds_a_call, take_turns, warm_heap
 from benchmarks.tables import Table, report
-from halgan_rl.ddpg import make_agent
-from halgan_rl.experiment import make_buffer, make_hallucinator, make_hindsight
-from halgan_rl.hallucinators import Hallucinator
-from halgan_rl.training import draw_batches
+from halgan_rl.agents.ddpg import make_agent
+from halgan_rl.experiment.run import make_buffer, make_hallucinator, make_hindsight
+from halgan_rl.hallucination.hallucinators import Hallucinator
+from halgan_rl.training.loop import draw_batches
 from recipes.ddpg_navigate import Config
 
 PAINTERS: dict[str, dict[str, Any]] = {
@@ -81,7 +81,7 @@ def main(benchmark: Benchmark) -> None:
     torch.manual_seed(0)
     warm_heap()
     default = Config()
-    env = envs.make(default.environment, seed=0)
+    env = halgan_envs.make(default.environment, seed=0)
     rollout = env.rollout(benchmark.rows, break_when_any_done=False)
     env.close()
     mean_share = default.hallucination_start * (1 - default.total_frames / default.hallucination_frames / 2)
@@ -90,7 +90,7 @@ def main(benchmark: Benchmark) -> None:
         config = dataclasses.replace(default, hallucination_start=share)
         updates[f"not painted, {share:.1%} drawn"] = make_updates(config, rollout, paint_nothing, benchmark.updates)
         for name, changes in PAINTERS.items():
-            hallucinator = make_hallucinator(dataclasses.replace(config, **changes), envs)
+            hallucinator = make_hallucinator(dataclasses.replace(config, **changes), halgan_envs)
             updates[f"{name}, {share:.1%} drawn"] = make_updates(config, rollout, hallucinator, benchmark.updates)
     measures = {name: partial(seconds_a_call, run, 1) for name, run in updates.items()}
     seconds = take_turns(measures, benchmark.rounds)

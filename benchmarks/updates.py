@@ -44,12 +44,12 @@ from benchmarks.plain_vision import PlainVision
 from benchmarks.rounds import ratio, seconds_a_call, take_turns, warm_heap
 from benchmarks.rows import Rows, channels_first, plain
 from benchmarks.tables import Table, report
-from halgan_rl import ddpg, ddqn
-from halgan_rl.experiment import make_buffer
-from halgan_rl.hindsight_config import HindsightConfig
-from halgan_rl.models.agents import Actor, Critic, QNetwork, Vision, greedy_policy, see
-from halgan_rl.models.halving import Downsample
-from halgan_rl.training import Agent, draw_batches
+from halgan_rl.agents import ddpg, ddqn
+from halgan_rl.agents.fast_cpu.block_convolutions import Downsample
+from halgan_rl.agents.networks import Actor, Critic, QNetwork, Vision, greedy_policy, see
+from halgan_rl.experiment.config import HindsightConfig
+from halgan_rl.experiment.run import make_buffer
+from halgan_rl.training.loop import Agent, draw_batches
 from recipes import ddpg_navigate, ddqn_pebble
 
 Updates = Callable[[int], object]

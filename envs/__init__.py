@@ -1,7 +1,7 @@
 """Simulated rooms in which a robot looks for its goal; knows no learning.
 
->>> import envs
->>> env = envs.make("navigate-2m", seed=0)
+>>> import halgan_envs
+>>> env = halgan_envs.make("navigate-2m", seed=0)
 >>> env.reset()["pixels"].shape
 torch.Size([64, 64, 3])
 >>> env.close()
@@ -11,17 +11,17 @@ Importing it registers the Gymnasium ids of all named environments, e.g. ``halga
 
 from typing import Any
 
-from envs import gl_backend  # First: it settles the OpenGL backend, which mujoco and dm_control read once.
-from envs.environment import Environment
-from envs.golden import fingerprint
-from envs.gymnasium_env import GymnasiumEnv, gymnasium_id, register_named
-from envs.names import NAMES, goal_offsets, named, pose_flags
-from envs.navigate import navigate_2m, navigate_4m
-from envs.near_goal import collect_failed, collect_near_goal
-from envs.oracle import GoalRenderer
-from envs.pebble import find_pebble
-from envs.pick_and_place import pick_and_place_2m
-from envs.torchrl_env import ComposerEnv
+from . import rendering  # First: it settles the OpenGL backend, which mujoco and dm_control read once.
+from .adapters.gymnasium_env import GymnasiumEnv, gymnasium_id, register_named
+from .adapters.torchrl_env import ComposerEnv
+from .environment import Environment
+from .near_goal import collect_failed, collect_near_goal
+from .oracle import GoalRenderer
+from .rendering.fingerprint import fingerprint
+from .suite.names import NAMES, goal_offsets, named, pose_flags
+from .suite.navigate import navigate_2m, navigate_4m
+from .suite.pebble import find_pebble
+from .suite.pick_and_place import pick_and_place_2m
 
 __all__ = [
     "NAMES",
@@ -33,7 +33,6 @@ __all__ = [
     "collect_near_goal",
     "find_pebble",
     "fingerprint",
-    "gl_backend",
     "goal_offsets",
     "gymnasium_id",
     "make",
@@ -42,6 +41,7 @@ __all__ = [
     "navigate_4m",
     "pick_and_place_2m",
     "pose_flags",
+    "rendering",
 ]
 
 register_named()

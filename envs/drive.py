@@ -1,4 +1,4 @@
-"""Drive the robot with the arrow keys: ``python -m envs.drive --environment navigate-2m``."""
+"""Drive the robot with the arrow keys: ``python -m halgan_envs.drive --environment navigate-2m``."""
 
 from typing import Any
 
@@ -6,9 +6,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 
-from envs.environment import Environment
-from envs.names import named
-from envs.transition import read
+from .adapters.transition import read
+from .environment import Environment
+from .suite.names import named
 
 
 class ArrowKeys:
@@ -78,7 +78,7 @@ class Cockpit:
 
 
 def main(environment: str = "navigate-2m") -> None:
-    """Drive a robot with the arrow keys until the window is closed; environment is one of ``envs.NAMES``."""
+    """Drive a robot with the arrow keys until the window is closed; environment is one of ``halgan_envs.NAMES``."""
     # Free the arrow keys, which matplotlib takes for back and forward in the history of views.
     plt.rcParams.update({"keymap.back": [], "keymap.forward": []})
     room = named(environment)()

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from dm_control import composer
 
-from envs.rendering import PersistentCamera
+from .rendering.persistent_camera import PersistentCamera
 
 
 class Environment(composer.Environment):

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from envs.environment import Environment
-from envs.tasks.goal import Goal, in_robot_frame
-from envs.transition import random_action
+from .adapters.transition import random_action
+from .environment import Environment
+from .tasks.goal import Goal, in_robot_frame
 
 _CALM_DISTANCE = 2.5
 """Farther from the goal than this, in units of the goal's offset, the driver wanders little."""

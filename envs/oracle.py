@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from envs.arenas.arena import WALL_GROUP
-from envs.environment import Environment
-from envs.names import named
+from .arenas.arena import WALL_GROUP
+from .environment import Environment
+from .suite.names import named
 
 
 class GoalRenderer:

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import tyro
 
-from halgan_rl import pictures
-from halgan_rl.run_folder import read_metrics
+from halgan_rl.experiment import pictures
+from halgan_rl.experiment.run_folder import read_metrics
 
 
 @dataclasses.dataclass(frozen=True)

@@ -40,7 +40,7 @@ Differences from the paper (Sahni et al., NeurIPS 2019, appendix), all undone by
    that fail mostly stand in a corner and turn to and fro; they unlearn it sooner the more they act by themselves.
 9. Relabelling decays over 60,000 frames instead of 100,000 (which the paper does not state; its epsilon's span).
 10. The shipped generator is this library's (see ``recipes/train_halgan.py``); ``--weights`` takes any other. Its
-    output is tabulated once and then looked up (`halgan_rl.hallucination_bank`); ``--no-bank`` asks the generator.
+    output is tabulated once and then looked up (`halgan_rl.hallucination.bank`); ``--no-bank`` asks the generator.
     Both images of a row show one latent's goal (the paper does not tell; its preset draws one for each image).
 11. The actor's last layer starts near zero, as in DDPG's own paper: without it an untrained robot may drive in circles
     that meet the box by chance (8 % of the starts with seed 0).
@@ -52,17 +52,18 @@ Differences from the paper (Sahni et al., NeurIPS 2019, appendix), all undone by
     which it then stands.
 
 In both rooms the rover has no reverse gear, action -1 is rest and +1 full speed: a random walk that reverses takes half
-of its hindsight goals from behind the robot, where no camera sees them (``envs.make(..., reverse_speed=0.5)`` gives it
+of its hindsight goals from behind the robot, where no camera sees them (``halgan_envs.make(..., reverse_speed=0.5)`` gives it
 one).
 """
 
 import dataclasses
 from pathlib import Path
 
-import envs
-from halgan_rl.ddpg import PAPER, DDPGConfig, make_agent
-from halgan_rl.experiment import run
-from halgan_rl.presets import parse_config
+import halgan_envs
+
+from halgan_rl.agents.ddpg import PAPER, DDPGConfig, make_agent
+from halgan_rl.experiment.presets import parse_config
+from halgan_rl.experiment.run import run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,7 +96,7 @@ PRESETS = {
 
 def main(config: Config) -> None:
     """Train, evaluate, and write everything into `config.out`."""
-    success = run(config, make_agent, envs)
+    success = run(config, make_agent, halgan_envs)
     print(
         f"success rate {success:.0%} after {config.total_frames} frames; pictures and weights in {config.out}\n"
         f"next: python recipes/play.py --run {config.out}"

@@ -26,10 +26,11 @@ Differences from the paper, besides those numbered in ``ddpg_navigate.py`` (but 
 import dataclasses
 from pathlib import Path
 
-import envs
-from halgan_rl.ddpg import PAPER, DDPGConfig, make_agent
-from halgan_rl.experiment import run
-from halgan_rl.presets import parse_config
+import halgan_envs
+
+from halgan_rl.agents.ddpg import PAPER, DDPGConfig, make_agent
+from halgan_rl.experiment.presets import parse_config
+from halgan_rl.experiment.run import run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,7 +38,7 @@ class Config(DDPGConfig):
     """Pick & place with DDPG and hindsight."""
 
     environment: str = "pick-and-place-2m"
-    """One of `envs.NAMES`."""
+    """One of `halgan_envs.NAMES`."""
     total_frames: int = 60_000
     """Environment steps."""
     out: Path = Path("runs/ddpg_pick_place")
@@ -69,7 +70,7 @@ PRESETS = {
 
 def main(config: Config) -> None:
     """Train, evaluate, and write everything into `config.out`."""
-    success = run(config, make_agent, envs)
+    success = run(config, make_agent, halgan_envs)
     print(
         f"success rate {success:.0%} after {config.total_frames} frames; pictures and weights in {config.out}\n"
         f"next: python recipes/play.py --run {config.out}"

@@ -22,11 +22,12 @@ What the four actions do, which the paper does not tell, decides whether a greed
 import dataclasses
 from pathlib import Path
 
-import envs
-from halgan_rl.ddqn import DDQNConfig, make_agent
-from halgan_rl.experiment import run
-from halgan_rl.hindsight_config import PAPER
-from halgan_rl.presets import parse_config
+import halgan_envs
+
+from halgan_rl.agents.ddqn import DDQNConfig, make_agent
+from halgan_rl.experiment.config import PAPER
+from halgan_rl.experiment.presets import parse_config
+from halgan_rl.experiment.run import run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,7 +35,7 @@ class Config(DDQNConfig):
     """The TurtleBot's pebble with double DQN and hindsight."""
 
     environment: str = "pebble"
-    """One of `envs.NAMES`."""
+    """One of `halgan_envs.NAMES`."""
     total_frames: int = 30_000
     """Environment steps."""
     out: Path = Path("runs/ddqn_pebble")
@@ -65,7 +66,7 @@ PRESETS = {
 
 def main(config: Config) -> None:
     """Train, evaluate, and write everything into `config.out`."""
-    success = run(config, make_agent, envs)
+    success = run(config, make_agent, halgan_envs)
     print(
         f"success rate {success:.0%} after {config.total_frames} frames; pictures and weights in {config.out}\n"
         f"next: python recipes/play.py --run {config.out}"

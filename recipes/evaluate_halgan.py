@@ -25,19 +25,20 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import halgan_envs
 import numpy as np
 import torch
 import tyro
 from torch import Tensor
 
-import envs
-from halgan_rl import fidelity, pictures
-from halgan_rl.hallucination_bank import BankGrid, HallucinationBank
-from halgan_rl.hallucinators import GanHallucinator, Hallucinator
-from halgan_rl.pose_probe import PoseProbe, polar_goal, train_probe
+from halgan_rl.experiment import pictures
+from halgan_rl.experiment.run_folder import check_unused, versions, write_json
+from halgan_rl.hallucination.bank import BankGrid, HallucinationBank
+from halgan_rl.hallucination.hallucinators import GanHallucinator, Hallucinator
+from halgan_rl.hallucination.judging import fidelity
+from halgan_rl.hallucination.judging.pose_probe import PoseProbe, polar_goal, train_probe
+from halgan_rl.hallucination.weights import load_generator, read_manifest, shipped_weights
 from halgan_rl.poses import flag_number
-from halgan_rl.run_folder import check_unused, versions, write_json
-from halgan_rl.weights import load_generator, read_manifest, shipped_weights
 
 IN_VIEW = 0.36
 """Bearing within which the whole goal is in view [rad]: the camera sees 0.43 to either side."""
@@ -77,15 +78,18 @@ def main(config: Config) -> None:
     """Collect, paint, compare, and write the report."""
     check_unused(config.out)
     path = config.weights or shipped_weights(config.environment)
-    expected, pose_size = envs.fingerprint(config.environment), 3 + len(envs.pose_flags(config.environment))
+    expected, pose_size = (
+        halgan_envs.fingerprint(config.environment),
+        3 + len(halgan_envs.pose_flags(config.environment)),
+    )
     generator = load_generator(path, expected=expected, pose_size=pose_size)
     rng = torch.Generator().manual_seed(config.seed)
     torch.manual_seed(config.seed)
     hallucinator: Hallucinator = GanHallucinator(generator, rng=rng, share_latent=config.share_latent)
     if config.bank:
-        grid = BankGrid(goal_offset=envs.goal_offsets(config.environment))
+        grid = BankGrid(goal_offset=halgan_envs.goal_offsets(config.environment))
         hallucinator = HallucinationBank(generator, grid, rng=rng, share_latent=config.share_latent)
-    renderer = envs.GoalRenderer(config.environment)
+    renderer = halgan_envs.GoalRenderer(config.environment)
 
     probe = make_probe(config, rng)
     failed = draw_failures(config, renderer, rng)
@@ -109,7 +113,7 @@ def make_probe(config: Config, rng: torch.Generator) -> PoseProbe:
 
 
 def probe_errors(
-    probe: PoseProbe, config: Config, renderer: envs.GoalRenderer, painter: Hallucinator
+    probe: PoseProbe, config: Config, renderer: halgan_envs.GoalRenderer, painter: Hallucinator
 ) -> dict[str, Any]:
     """Compare the probe's errors on held-out real frames and on the same poses painted."""
     data = in_view(near_goal(config, config.frames, config.seed + 1))
@@ -125,7 +129,7 @@ def probe_errors(
 
 
 def mask_overlaps(
-    failed: dict[str, Tensor], renderer: envs.GoalRenderer, painter: Hallucinator
+    failed: dict[str, Tensor], renderer: halgan_envs.GoalRenderer, painter: Hallucinator
 ) -> dict[str, dict[str, Any]]:
     """Compare what is painted into failed frames with what the simulator shows there, band by band."""
     frames, truth, painted = failed["pixels"], paint(renderer, failed), paint(painter, failed)
@@ -159,7 +163,7 @@ def mask_overlaps(
 
 
 def consistency(
-    probe: PoseProbe, config: Config, renderer: envs.GoalRenderer, painter: Hallucinator
+    probe: PoseProbe, config: Config, renderer: halgan_envs.GoalRenderer, painter: Hallucinator
 ) -> dict[str, float]:
     """Return how far the goal seems to wander in the room while the robot moves [m], the root mean square.
 
@@ -193,23 +197,23 @@ def stretches(data: dict[str, Tensor]) -> list[dict[str, Tensor]]:
 
 def near_goal(config: Config, count: int, seed: int) -> dict[str, Tensor]:
     """Collect near-goal frames of successful rollouts."""
-    environment = envs.named(config.environment)(random_state=seed)
-    data = envs.collect_near_goal(environment, count, np.random.RandomState(seed))
+    environment = halgan_envs.named(config.environment)(random_state=seed)
+    data = halgan_envs.collect_near_goal(environment, count, np.random.RandomState(seed))
     environment.close()
     return with_offsets(config, {name: torch.from_numpy(array) for name, array in data.items()})
 
 
 def with_offsets(config: Config, data: dict[str, Tensor]) -> dict[str, Tensor]:
     """Add how far ahead of its goal pose each row's goal stands."""
-    offsets = torch.tensor(envs.goal_offsets(config.environment))
+    offsets = torch.tensor(halgan_envs.goal_offsets(config.environment))
     return data | {"goal_offset": offsets[flag_number(data["pose"])]}
 
 
-def draw_failures(config: Config, renderer: envs.GoalRenderer, rng: torch.Generator) -> dict[str, Tensor]:
+def draw_failures(config: Config, renderer: halgan_envs.GoalRenderer, rng: torch.Generator) -> dict[str, Tensor]:
     """Walk at random; return poses, goals some steps ahead, and the frames from there without any box."""
-    environment = envs.named(config.environment)(random_state=config.seed + 3)
+    environment = halgan_envs.named(config.environment)(random_state=config.seed + 3)
     pose = torch.from_numpy(
-        envs.collect_failed(environment, 10 * config.frames, np.random.RandomState(config.seed + 3))["pose"]
+        halgan_envs.collect_failed(environment, 10 * config.frames, np.random.RandomState(config.seed + 3))["pose"]
     )
     step = environment.task.robot.max_speed * environment.task.control_timestep
     environment.close()
@@ -222,7 +226,7 @@ def draw_failures(config: Config, renderer: envs.GoalRenderer, rng: torch.Genera
     return without_goal({name: entry[: config.frames] for name, entry in data.items()}, renderer)
 
 
-def without_goal(data: dict[str, Tensor], renderer: envs.GoalRenderer) -> dict[str, Tensor]:
+def without_goal(data: dict[str, Tensor], renderer: halgan_envs.GoalRenderer) -> dict[str, Tensor]:
     """Return the data with the frames that are seen in a room without a box."""
     frames = np.stack([renderer.render_without_goal(pose) for pose in data["pose"].double().numpy()])
     return data | {"pixels": torch.from_numpy(frames)}
@@ -263,7 +267,7 @@ def in_room(pose: Tensor, seen: Tensor) -> Tensor:
     return pose[:, :2] + distance[:, None] * torch.stack([heading.cos(), heading.sin()], -1)
 
 
-def draw(config: Config, failed: dict[str, Tensor], renderer: envs.GoalRenderer, painter: Hallucinator) -> None:
+def draw(config: Config, failed: dict[str, Tensor], renderer: halgan_envs.GoalRenderer, painter: Hallucinator) -> None:
     """Draw a few failed frames with the goal in view: as they were, the truth, and hallucinated."""
     chosen = {name: entry[:16] for name, entry in in_view(failed).items()}
     rows = {"failed": chosen["pixels"], "truth": paint(renderer, chosen), "hallucinated": paint(painter, chosen)}

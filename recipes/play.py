@@ -10,14 +10,14 @@ import dataclasses
 from functools import partial
 from pathlib import Path
 
+import halgan_envs
 import torch
 import tyro
 
-import envs
-from halgan_rl import pictures
-from halgan_rl.evaluation import evaluate, record
-from halgan_rl.models.agents import Actor, QNetwork, deterministic_policy, greedy_policy
-from halgan_rl.weights import load_module, read_manifest
+from halgan_rl.agents.networks import Actor, QNetwork, deterministic_policy, greedy_policy
+from halgan_rl.experiment import pictures
+from halgan_rl.hallucination.weights import load_module, read_manifest
+from halgan_rl.training.evaluation import evaluate, record
 
 POLICIES = {Actor.kind: (Actor, deterministic_policy), QNetwork.kind: (QNetwork, greedy_policy)}
 """Kind of a saved network: how it is rebuilt, and how it acts."""
@@ -46,7 +46,7 @@ def main(config: Config) -> None:
     build, make_policy = POLICIES[read_manifest(path)["kind"]]
     network, manifest = load_module(path, build)
     policy = make_policy(network)
-    env = envs.make(manifest["environment"])
+    env = halgan_envs.make(manifest["environment"])
     seeds = range(config.first_seed, config.first_seed + config.starts)
     result = evaluate(env, policy, seeds=seeds)
     print(

@@ -33,7 +33,7 @@ Differences from the paper (Sahni et al., NeurIPS 2019, appendix), all undone by
 1. The generator paints by coordinates (`CoordinateGenerator`) instead of by upsampling convolutions.
 2. It paints a matte, colour and opacity, which is the identity where it paints nothing, instead of tanh(s + H).
 3. The configuration is the whole relative pose (x, y, sin yaw, cos yaw), standardised, instead of distance and bearing.
-4. A warm start fits the generator to the colours that only near-goal frames show (`halgan_rl.warm_start`), and the
+4. A warm start fits the generator to the colours that only near-goal frames show (`halgan_rl.hallucination.training.matte_regression`), and the
    game is not played after it: in two minutes it gets to a mask overlap of 0.80 (2 m room), which six minutes of the
    game bring down to 0.19. Without warm start the game with the deviations below gets to 0.26 in eight minutes, the
    paper's loop to 0.21 in thirty (`benchmarks.halgan_ablation`).
@@ -54,20 +54,22 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+import halgan_envs
 import numpy as np
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
-import envs
-from halgan_rl import fidelity, pictures
-from halgan_rl.gan_training import GanSettings, HalganTrainer
-from halgan_rl.hallucinators import GanHallucinator
-from halgan_rl.models import CoordinateGenerator, Discriminator, HallucinationGenerator, PaperGenerator
-from halgan_rl.presets import parse_config
-from halgan_rl.run_folder import RunFolder, versions
-from halgan_rl.warm_start import warm_start
-from halgan_rl.weights import save_weights
+from halgan_rl.experiment import pictures
+from halgan_rl.experiment.presets import parse_config
+from halgan_rl.experiment.run_folder import RunFolder, versions
+from halgan_rl.hallucination.generators.coordinates import CoordinateGenerator
+from halgan_rl.hallucination.generators.paper import Discriminator, HallucinationGenerator, PaperGenerator
+from halgan_rl.hallucination.hallucinators import GanHallucinator
+from halgan_rl.hallucination.judging import fidelity
+from halgan_rl.hallucination.training.adversarial import GanSettings, HalganTrainer
+from halgan_rl.hallucination.training.matte_regression import warm_start
+from halgan_rl.hallucination.weights import save_weights
 
 COLUMNS = (
     "steps",
@@ -92,7 +94,7 @@ class Config:
     preset: Literal["default", "paper"] = "default"
     """Where the other values come from: what learns fastest on two cores, or the paper's appendix."""
     environment: str = "navigate-2m"
-    """One of `envs.NAMES`."""
+    """One of `halgan_envs.NAMES`."""
     seed: int = 0
     """Seed of everything random in the run."""
     iterations: int = 0
@@ -180,16 +182,16 @@ PRESETS = {
 
 def main(config: Config) -> None:
     """Collect frames, train, compare with the truth, and write everything into `config.out`."""
-    envs.named(config.environment)  # refuses an unknown one before the folder is made
+    halgan_envs.named(config.environment)  # refuses an unknown one before the folder is made
     folder = RunFolder(config.out, columns=COLUMNS)
     folder.write_config(dataclasses.asdict(config))
     torch.manual_seed(config.seed)  # initial weights
     rng = torch.Generator().manual_seed(config.seed)
 
     # Data: near-goal and failed frames, and held-out poses with the truth about them.
-    collect_near_goal = partial(envs.collect_near_goal, steps_before_goal=config.steps_before_goal)
+    collect_near_goal = partial(halgan_envs.collect_near_goal, steps_before_goal=config.steps_before_goal)
     near_goal = collect(config, collect_near_goal, config.near_goal_frames, config.seed)
-    failed = collect(config, envs.collect_failed, config.failed_frames, config.seed + 1)
+    failed = collect(config, halgan_envs.collect_failed, config.failed_frames, config.seed + 1)
     truth = render_truth(config)
 
     # The generator.
@@ -246,7 +248,7 @@ def train(
 
 def collect(config: Config, collector: Any, count: int, seed: int) -> dict[str, Tensor]:
     """Collect `count` frames in an environment of their own, as tensors."""
-    environment = envs.named(config.environment)(random_state=seed)
+    environment = halgan_envs.named(config.environment)(random_state=seed)
     data = collector(environment, count, np.random.RandomState(seed))
     environment.close()
     return {name: torch.from_numpy(array) for name, array in data.items()}
@@ -254,9 +256,9 @@ def collect(config: Config, collector: Any, count: int, seed: int) -> dict[str, 
 
 def render_truth(config: Config) -> dict[str, Tensor]:
     """Return held-out poses with the frames seen from them: without goal, and with the goal rendered."""
-    data = collect(config, envs.collect_near_goal, 8 * config.held_out_frames, HELD_OUT_SEED)
+    data = collect(config, halgan_envs.collect_near_goal, 8 * config.held_out_frames, HELD_OUT_SEED)
     data = {name: tensor[::8] for name, tensor in data.items()}
-    renderer = envs.GoalRenderer(config.environment)
+    renderer = halgan_envs.GoalRenderer(config.environment)
     data["empty"] = torch.from_numpy(np.stack([renderer.render_without_goal(pose) for pose in data["pose"].numpy()]))
     data["truth"] = renderer(*(data[name].unsqueeze(1) for name in ("empty", "pose", "goal_pose"))).squeeze(1)
     renderer.close()
@@ -289,7 +291,7 @@ def make_manifest(config: Config, generator: HallucinationGenerator, metrics: di
     return {
         "kind": config.generator,
         "arguments": generator.arguments,
-        **envs.fingerprint(config.environment),
+        **halgan_envs.fingerprint(config.environment),
         "command": shlex.join(["python", *sys.argv]),
         "config": dataclasses.asdict(config),
         "metrics": metrics,

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from halgan_rl.models.coordinates import CoordinateGenerator
+from halgan_rl.hallucination.generators.coordinates import CoordinateGenerator
 from halgan_rl.poses import relative_pose
 
 RED = torch.tensor([200, 20, 20], dtype=torch.uint8)

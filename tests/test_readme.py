@@ -3,9 +3,8 @@
 import re
 from pathlib import Path
 
+import halgan_envs
 import pytest
-
-import envs
 
 ROOT = Path(__file__).parents[1]
 README, CONTRIBUTING, RESULTS = ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "results" / "README.md"
@@ -29,7 +28,7 @@ def test_the_examples_run_relabel_rows_and_fix_a_start() -> None:
 def test_the_task_that_contributing_adds_can_be_solved_and_gives_near_goal_frames(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setitem(envs.NAMES, "look-at-2m", None)  # so that it is gone afterwards
+    monkeypatch.setitem(halgan_envs.NAMES, "look-at-2m", None)  # so that it is gone afterwards
     (added,) = run_examples(CONTRIBUTING)
     assert added["near_goal"]["pixels"].shape == (100, 64, 64, 3)
     box = added["near_goal"]["pixels"][-1].astype(int)

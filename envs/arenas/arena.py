@@ -3,7 +3,7 @@
 import numpy as np
 from dm_control import composer
 
-from envs.props.mocap_prop import MocapProp
+from ..props.mocap_prop import MocapProp
 
 WALL_GROUP = 1
 """Group of the geoms that may hide a goal, by which a camera can leave them out."""

@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from envs.arenas import textures
-from envs.arenas.arena import WALL_GROUP, Arena
-from envs.contact import CONTACT
+from ..contact import CONTACT
+from . import textures
+from .arena import WALL_GROUP, Arena
 
 _KERB_WIDTH = 0.12
 _KERB_HEIGHT = 0.1

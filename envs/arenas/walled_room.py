@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from envs.arenas.arena import WALL_GROUP, Arena
-from envs.contact import CONTACT
+from ..contact import CONTACT
+from .arena import WALL_GROUP, Arena
 
 _WALLS = (
     # name, direction of the outward normal, two colours: none bright, as the goals are.

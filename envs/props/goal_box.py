@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from dm_control import mjcf
 
-from envs.contact import CONTACT
-from envs.props.mocap_prop import MocapProp
+from ..contact import CONTACT
+from .mocap_prop import MocapProp
 
 RED = (0.85, 0.08, 0.06, 1.0)
 GREEN = (0.05, 0.62, 0.10, 1.0)

@@ -3,7 +3,7 @@
 import numpy as np
 from dm_control import mjcf
 
-from envs.props.mocap_prop import MocapProp
+from .mocap_prop import MocapProp
 
 _LUMPS = (
     # Position and half axes in units of the stone's size, and the angle about the vertical.

@@ -6,8 +6,8 @@ import numpy as np
 from dm_control import mjcf
 from dm_env import specs
 
-from envs.contact import CONTACT
-from envs.robots.sighted_robot import HIDDEN, SightedRobot
+from ..contact import CONTACT
+from .sighted_robot import HIDDEN, SightedRobot
 
 _LAG = 0.025
 """Time constant of the velocity servos [s]; above half a physics substep, or they would oscillate."""

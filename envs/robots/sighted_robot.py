@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from dm_control import composer, mjcf
 
-from envs.rendering import PersistentCamera
+from ..rendering.persistent_camera import PersistentCamera
 
 HIDDEN = 4
 """A geom group that cameras leave out."""

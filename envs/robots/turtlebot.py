@@ -7,9 +7,9 @@ import numpy as np
 from dm_control import composer, mjcf
 from dm_env import specs
 
-from envs.contact import CONTACT
-from envs.robots.rover import wrap_angle
-from envs.robots.sighted_robot import HIDDEN, SightedRobot
+from ..contact import CONTACT
+from .rover import wrap_angle
+from .sighted_robot import HIDDEN, SightedRobot
 
 BODY_GROUP = 2
 """Group of all of the robot that can be seen; its own camera leaves it out, since it would see nothing of it."""

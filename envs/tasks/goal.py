@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from envs.props.mocap_prop import MocapProp
+from ..props.mocap_prop import MocapProp
 
 OVERSHOOT = 0.02
 """How much closer than the goal's distance a robot comes in the step that reaches it, on average over scripted

@@ -9,10 +9,10 @@ import numpy as np
 from dm_control import composer
 from dm_env import specs
 
-from envs.arenas.arena import Arena
-from envs.observables import KnownSpec
-from envs.tasks.fixed_start import read_start
-from envs.tasks.goal import Goal
+from ..arenas.arena import Arena
+from ..observables import KnownSpec
+from .fixed_start import read_start
+from .goal import Goal
 
 _OUT_OF_SIGHT = np.array([0.0, 100.0])
 """Position x, y [m] where a box is put when it must not be seen."""
@@ -34,7 +34,7 @@ class GoalTask(composer.Task):
     A subclass offers :meth:`goal` and says in ``after_step`` when ``_succeeded``; one with flags extends :meth:`pose`.
 
     Args:
-        robot: The robot, e.g. ``envs.robots.rover.Rover``.
+        robot: The robot, e.g. ``halgan_envs.robots.rover.Rover``.
         arena: The room; robot and boxes are attached to it.
         goals: The goals, each by the name under which :meth:`fix_start` knows its box.
         min_start_distance: At least so far are the robot and each box apart at the start of an episode [m].

@@ -1,10 +1,10 @@
 """Navigate: find the box, drive up to it, and centre it in the image."""
 
-from envs.arenas.walled_room import WalledRoom
-from envs.props.goal_box import GoalBox
-from envs.robots.rover import Rover
-from envs.tasks.goal import OVERSHOOT, Goal
-from envs.tasks.single_goal import SingleGoalTask
+from ..arenas.walled_room import WalledRoom
+from ..props.goal_box import GoalBox
+from ..robots.rover import Rover
+from .goal import OVERSHOOT, Goal
+from .single_goal import SingleGoalTask
 
 _SUCCESS_DISTANCE = 0.16
 GOAL_OFFSET = _SUCCESS_DISTANCE - OVERSHOOT

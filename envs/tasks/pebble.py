@@ -1,10 +1,10 @@
 """FindPebble: find a pebble on the road, drive up to it, and centre it in the image."""
 
-from envs.arenas.road import Road
-from envs.props.pebble import Pebble
-from envs.robots.turtlebot import TurtleBot
-from envs.tasks.goal import Goal
-from envs.tasks.single_goal import SingleGoalTask
+from ..arenas.road import Road
+from ..props.pebble import Pebble
+from ..robots.turtlebot import TurtleBot
+from .goal import Goal
+from .single_goal import SingleGoalTask
 
 
 class FindPebble(SingleGoalTask):

@@ -6,10 +6,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from envs.arenas.walled_room import WalledRoom
-from envs.props.goal_box import GoalBox
-from envs.tasks.goal import Goal
-from envs.tasks.goal_task import GoalTask
+from ..arenas.walled_room import WalledRoom
+from ..props.goal_box import GoalBox
+from .goal import Goal
+from .goal_task import GoalTask
 
 _HELD = 3
 """Index of the flag in a pose."""

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from envs.arenas.arena import Arena
-from envs.tasks.goal import Goal
-from envs.tasks.goal_task import GoalTask
+from ..arenas.arena import Arena
+from .goal import Goal
+from .goal_task import GoalTask
 
 
 class SingleGoalTask(GoalTask):

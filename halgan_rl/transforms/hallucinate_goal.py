@@ -8,11 +8,11 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
-from halgan_rl.rows import replace_rows
 from halgan_rl.transforms.base import ReplayTransform, next_key
+from halgan_rl.transforms.rows import replace_rows
 
 if TYPE_CHECKING:
-    from halgan_rl.hallucinators import Hallucinator
+    from halgan_rl.hallucination.hallucinators import Hallucinator
 
 
 SEEN = 16

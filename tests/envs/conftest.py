@@ -3,17 +3,16 @@
 from collections.abc import Iterator
 from typing import Any
 
+import halgan_envs
 import mujoco
 import numpy as np
 import pytest
-
-import envs
 
 
 class Stage:
     """An environment in which a test puts robot and box where it wants them."""
 
-    def __init__(self, environment: envs.Environment) -> None:
+    def __init__(self, environment: halgan_envs.Environment) -> None:
         self.environment = environment
         self.task = environment.task
         self.robot = environment.task.robot
@@ -38,19 +37,19 @@ class Stage:
 
 
 @pytest.fixture(scope="module")
-def room_2m() -> Iterator[envs.Environment]:
-    environment = envs.navigate_2m(random_state=0)
+def room_2m() -> Iterator[halgan_envs.Environment]:
+    environment = halgan_envs.navigate_2m(random_state=0)
     yield environment
     environment.close()
 
 
 @pytest.fixture
-def stage(room_2m: envs.Environment) -> Stage:
+def stage(room_2m: halgan_envs.Environment) -> Stage:
     return Stage(room_2m)
 
 
-@pytest.fixture(params=sorted(envs.NAMES))
-def named_environment(request: pytest.FixtureRequest) -> Iterator[envs.Environment]:
-    environment = envs.named(request.param)(random_state=3)
+@pytest.fixture(params=sorted(halgan_envs.NAMES))
+def named_environment(request: pytest.FixtureRequest) -> Iterator[halgan_envs.Environment]:
+    environment = halgan_envs.named(request.param)(random_state=3)
     yield environment
     environment.close()

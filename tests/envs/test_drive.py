@@ -4,15 +4,14 @@ import matplotlib
 
 matplotlib.use("Agg")
 
+import halgan_envs
 import numpy as np
 import pytest
+from halgan_envs import drive
+from halgan_envs.robots.rover import Rover
+from halgan_envs.robots.turtlebot import BACKWARD, FORWARD, LEFT, RIGHT, TurtleBot, motions_for
 from matplotlib import pyplot as plt
 from matplotlib.backend_bases import KeyEvent
-
-import envs
-from envs import drive
-from envs.robots.rover import Rover
-from envs.robots.turtlebot import BACKWARD, FORWARD, LEFT, RIGHT, TurtleBot, motions_for
 
 
 def held(*names):
@@ -48,7 +47,7 @@ def test_the_arrows_choose_among_discrete_actions(names, motion):
 
 def test_a_robot_that_cannot_stand_still_waits_for_a_key():
     assert held().action(TurtleBot()) is None
-    environment = envs.find_pebble(random_state=0)
+    environment = halgan_envs.find_pebble(random_state=0)
     cockpit = drive.Cockpit(environment)
     cockpit.tick()
     first = environment.task.robot.pose(environment.physics)

@@ -1,15 +1,14 @@
 import warnings
 
 import gymnasium
+import halgan_envs
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from tensordict import TensorDict
 
-import envs
-
 BRAKE = np.array([-1.0, 0.0], np.float32)
-IDS = {name: envs.gymnasium_id(name) for name in envs.NAMES}
+IDS = {name: halgan_envs.gymnasium_id(name) for name in halgan_envs.NAMES}
 ID = IDS["navigate-2m"]
 
 
@@ -25,7 +24,7 @@ def box_of(env):
     return environment.task.goals["box"].prop.position(environment.physics)
 
 
-@pytest.mark.parametrize("name", sorted(envs.NAMES))
+@pytest.mark.parametrize("name", sorted(halgan_envs.NAMES))
 def test_every_named_environment_passes_gymnasium_s_check_without_a_warning(name):
     env = gymnasium.make(IDS[name], render_mode="rgb_array")
     with warnings.catch_warnings():
@@ -43,7 +42,7 @@ def test_every_name_has_an_id_by_one_rule():
     }
     registered = {id_ for id_ in gymnasium.registry if id_.startswith("halgan_rl/")}
     assert registered == set(IDS.values())
-    assert {gymnasium.spec(id_).kwargs["name"] for id_ in registered} == set(envs.NAMES)
+    assert {gymnasium.spec(id_).kwargs["name"] for id_ in registered} == set(halgan_envs.NAMES)
 
 
 def test_gymnasium_imports_the_package_itself_if_asked_to():
@@ -52,7 +51,7 @@ def test_gymnasium_imports_the_package_itself_if_asked_to():
     env.close()
 
 
-@pytest.mark.parametrize("name", sorted(envs.NAMES))
+@pytest.mark.parametrize("name", sorted(halgan_envs.NAMES))
 def test_spaces_are_those_of_the_data_contract(name):
     env = gymnasium.make(IDS[name])
     pixels, pose = env.observation_space["pixels"], env.observation_space["pose"]
@@ -67,9 +66,9 @@ def test_spaces_are_those_of_the_data_contract(name):
     env.close()
 
 
-@pytest.mark.parametrize("name", sorted(envs.NAMES))
+@pytest.mark.parametrize("name", sorted(halgan_envs.NAMES))
 def test_equal_seeds_give_equal_episodes_and_those_of_the_torchrl_face(name):
-    env, twin = gymnasium.make(IDS[name]), envs.make(name, seed=7)
+    env, twin = gymnasium.make(IDS[name]), halgan_envs.make(name, seed=7)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(12)]
     episodes = [gymnasium_episode(env, seed, actions) for seed in (7, 7, 8)]
@@ -241,7 +240,7 @@ def test_the_view_shows_the_room_from_outside(env):
 
 
 def test_without_a_render_mode_there_is_no_view():
-    env = envs.GymnasiumEnv("navigate-2m")
+    env = halgan_envs.GymnasiumEnv("navigate-2m")
     env.reset(seed=0)
     assert env.render() is None
     env.close()
@@ -249,16 +248,16 @@ def test_without_a_render_mode_there_is_no_view():
 
 def test_an_unknown_render_mode_is_refused():
     with pytest.raises(ValueError, match=r"Unknown render_mode 'ansi': choose None or one of \['rgb_array'\]"):
-        envs.GymnasiumEnv("navigate-2m", render_mode="ansi")
+        halgan_envs.GymnasiumEnv("navigate-2m", render_mode="ansi")
 
 
 def test_an_unknown_name_lists_the_known_ones():
     with pytest.raises(ValueError, match=r"'navigate-3m'.*navigate-2m, navigate-4m"):
-        envs.GymnasiumEnv("navigate-3m")
+        halgan_envs.GymnasiumEnv("navigate-3m")
 
 
 def test_close_frees_both_cameras_and_may_be_repeated():
-    env = envs.GymnasiumEnv("navigate-2m", render_mode="rgb_array")
+    env = halgan_envs.GymnasiumEnv("navigate-2m", render_mode="rgb_array")
     env.reset(seed=0)
     env.render()
     cameras = [env.environment.task.robot.camera, env.environment._overview]

@@ -1,14 +1,13 @@
 import time
 
+import halgan_envs
 import numpy as np
 import pytest
-
-import envs
-from envs.arenas.walled_room import WalledRoom
-from envs.props.goal_box import GoalBox
-from envs.robots.rover import Rover
-from envs.tasks.navigate import Navigate
-from envs.transition import random_action
+from halgan_envs.adapters.transition import random_action
+from halgan_envs.arenas.walled_room import WalledRoom
+from halgan_envs.props.goal_box import GoalBox
+from halgan_envs.robots.rover import Rover
+from halgan_envs.tasks.navigate import Navigate
 
 
 def make_task(size=2.0, **arguments):
@@ -95,7 +94,7 @@ def test_every_named_environment_keeps_its_spec(named_environment):
 
 def test_the_rooms_have_the_paper_s_size_and_the_small_one():
     sizes = {}
-    for name, build in envs.NAMES.items():
+    for name, build in halgan_envs.NAMES.items():
         environment = build(random_state=0)
         task = environment.task
         sizes[name] = (*2 * task.arena.half_extent, *(goal.tolerance for goal in task.goals.values()))
@@ -120,10 +119,10 @@ def test_a_reset_never_recompiles(room_2m):
 
 
 def test_equal_seeds_give_equal_episodes():
-    first, second = (run_episode(envs.navigate_2m(random_state=7)) for _ in range(2))
+    first, second = (run_episode(halgan_envs.navigate_2m(random_state=7)) for _ in range(2))
     np.testing.assert_array_equal(first[0], second[0])
     np.testing.assert_array_equal(first[1], second[1])
-    other = run_episode(envs.navigate_2m(random_state=8))
+    other = run_episode(halgan_envs.navigate_2m(random_state=8))
     assert (first[1] != other[1]).any()
 
 
@@ -159,4 +158,4 @@ def test_bad_sizes_are_refused(build):
 
 def test_an_unknown_name_lists_the_known_ones():
     with pytest.raises(ValueError, match=r"'navigate-3m'.*navigate-2m, navigate-4m"):
-        envs.make("navigate-3m")
+        halgan_envs.make("navigate-3m")

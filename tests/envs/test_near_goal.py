@@ -1,13 +1,12 @@
+import halgan_envs
 import numpy as np
 import pytest
-
-import envs
-from envs.near_goal import collect_failed, collect_near_goal
+from halgan_envs.near_goal import collect_failed, collect_near_goal
 
 
 @pytest.fixture(scope="module")
 def near_goal():
-    environment = envs.navigate_2m(random_state=1)
+    environment = halgan_envs.navigate_2m(random_state=1)
     snapshots = collect_near_goal(environment, 150, np.random.RandomState(2))
     environment.close()
     return snapshots
@@ -34,7 +33,7 @@ def test_the_box_is_in_the_final_images(near_goal):
 
 
 def test_images_belong_to_their_poses(near_goal):
-    renderer = envs.GoalRenderer("navigate-2m")
+    renderer = halgan_envs.GoalRenderer("navigate-2m")
     row = int(np.hypot(*(near_goal["pose"] - near_goal["goal_pose"])[:, :2].T).argmax())
     ours = renderer.render(near_goal["pose"][row].astype(float)).astype(int)
     renderer.close()
@@ -48,7 +47,7 @@ def test_driving_repeats_by_seed():
 
 
 def drive(seed):
-    environment = envs.navigate_2m(random_state=0)
+    environment = halgan_envs.navigate_2m(random_state=0)
     snapshots = collect_near_goal(environment, 40, np.random.RandomState(seed), steps_before_goal=9, noise=(0.2, 0.5))
     environment.close()
     return snapshots
@@ -70,7 +69,7 @@ def test_a_count_below_one_is_refused(room_2m, collect):
 
 
 def test_a_hopeless_driver_is_reported():
-    environment = envs.navigate_2m(random_state=0, time_limit=0.2)
+    environment = halgan_envs.navigate_2m(random_state=0, time_limit=0.2)
     with pytest.raises(RuntimeError, match="failed 100 times in a row"):
         collect_near_goal(environment, 5, np.random.RandomState(0))
     environment.close()

@@ -1,13 +1,12 @@
+import halgan_envs
 import numpy as np
 import pytest
 import torch
 
-import envs
-
 
 @pytest.fixture(scope="module")
 def renderer():
-    renderer = envs.GoalRenderer("navigate-2m")
+    renderer = halgan_envs.GoalRenderer("navigate-2m")
     yield renderer
     renderer.close()
 
@@ -85,7 +84,7 @@ def test_a_pose_without_yaw_is_refused(renderer):
 
 
 def test_rendering_after_close_says_so():
-    renderer = envs.GoalRenderer("navigate-2m")
+    renderer = halgan_envs.GoalRenderer("navigate-2m")
     camera = renderer._environment.task.robot.camera
     renderer.close()
     renderer.close()
@@ -94,7 +93,7 @@ def test_rendering_after_close_says_so():
 
 
 def test_a_fingerprint_tells_rooms_apart_and_repeats():
-    first, again, other = (envs.fingerprint(name) for name in ("navigate-2m", "navigate-2m", "navigate-4m"))
+    first, again, other = (halgan_envs.fingerprint(name) for name in ("navigate-2m", "navigate-2m", "navigate-4m"))
     assert first == again
     assert first["golden_frame"] != other["golden_frame"]
     assert set(first) == {"environment", "mujoco", "gl", "golden_frame"}

@@ -1,29 +1,28 @@
+import halgan_envs
 import mujoco
 import numpy as np
 import pytest
 import torch
 from dm_control.composer import EpisodeInitializationError
-
-import envs
-from envs.arenas.arena import WALL_GROUP
-from envs.arenas.road import Road
-from envs.near_goal import NoisyDriver, collect_failed, collect_near_goal
-from envs.props.pebble import Pebble
-from envs.robots.turtlebot import BACKWARD, BODY_GROUP, FAST, FORWARD, LEFT, RIGHT, TurtleBot
-from envs.tasks.pebble import FindPebble
-from envs.transition import read
+from halgan_envs.adapters.transition import read
+from halgan_envs.arenas.arena import WALL_GROUP
+from halgan_envs.arenas.road import Road
+from halgan_envs.near_goal import NoisyDriver, collect_failed, collect_near_goal
+from halgan_envs.props.pebble import Pebble
+from halgan_envs.robots.turtlebot import BACKWARD, BODY_GROUP, FAST, FORWARD, LEFT, RIGHT, TurtleBot
+from halgan_envs.tasks.pebble import FindPebble
 
 
 @pytest.fixture(scope="module")
 def road():
-    environment = envs.find_pebble(random_state=0)
+    environment = halgan_envs.find_pebble(random_state=0)
     yield environment
     environment.close()
 
 
 @pytest.fixture(scope="module")
 def renderer():
-    renderer = envs.GoalRenderer("pebble")
+    renderer = halgan_envs.GoalRenderer("pebble")
     yield renderer
     renderer.close()
 
@@ -84,7 +83,7 @@ def test_driving_up_to_the_pebble_succeeds(road, action, ahead):
 
 @pytest.fixture(scope="module")
 def reversing_road():
-    environment = envs.find_pebble(random_state=0, reverse_speed=0.4)
+    environment = halgan_envs.find_pebble(random_state=0, reverse_speed=0.4)
     yield environment
     environment.close()
 
@@ -146,7 +145,7 @@ def test_equal_seeds_give_equal_episodes():
 
 
 def episode(seed):
-    environment = envs.find_pebble(random_state=seed)
+    environment = halgan_envs.find_pebble(random_state=seed)
     actions = np.random.RandomState(0).randint(4, size=10)
     transitions = [read(environment.reset()), *(step(environment, action) for action in actions)]
     environment.close()
@@ -194,7 +193,7 @@ def test_roads_of_equal_seed_look_equal_and_others_do_not():
 
 
 def overview(arena):
-    environment = envs.Environment(FindPebble(TurtleBot(), arena, Pebble()), time_limit=25.0, random_state=0)
+    environment = halgan_envs.Environment(FindPebble(TurtleBot(), arena, Pebble()), time_limit=25.0, random_state=0)
     environment.reset()
     picture = environment.render_overview()
     environment.close()
@@ -300,7 +299,7 @@ def test_no_kerb_hides_the_oracle_s_pebble(renderer):
 
 @pytest.fixture(scope="module")
 def near_goal():
-    environment = envs.find_pebble(random_state=1)
+    environment = halgan_envs.find_pebble(random_state=1)
     snapshots = collect_near_goal(environment, 120, np.random.RandomState(2), steps_before_goal=16)
     environment.close()
     return snapshots
@@ -377,7 +376,7 @@ def test_failed_walks_move_and_turn_and_never_succeed(road):
 
 
 def test_the_body_of_the_robot_is_in_no_image(near_goal):
-    environment = envs.find_pebble(random_state=1)
+    environment = halgan_envs.find_pebble(random_state=1)
     environment.reset()
     assert not environment.task.robot.camera.options.geomgroup[BODY_GROUP]
     environment.close()

@@ -1,15 +1,14 @@
 from collections.abc import Iterator
 
+import halgan_envs
 import numpy as np
 import pytest
 import torch
-
-import envs
-from envs.arenas.walled_room import WalledRoom
-from envs.near_goal import collect_failed, collect_near_goal
-from envs.props.goal_box import GREEN, GoalBox
-from envs.robots.rover import Rover
-from envs.tasks.pick_and_place import PickAndPlace
+from halgan_envs.arenas.walled_room import WalledRoom
+from halgan_envs.near_goal import collect_failed, collect_near_goal
+from halgan_envs.props.goal_box import GREEN, GoalBox
+from halgan_envs.robots.rover import Rover
+from halgan_envs.tasks.pick_and_place import PickAndPlace
 
 FULL_SPEED, HALF_SPEED, BRAKE = np.array([1.0, 0.0]), np.array([0.0, 0.0]), np.array([-1.0, 0.0])
 
@@ -20,15 +19,15 @@ def make_task(size=2.0, **arguments):
 
 
 @pytest.fixture(scope="module")
-def environment() -> Iterator[envs.Environment]:
-    environment = envs.pick_and_place_2m(random_state=0)
+def environment() -> Iterator[halgan_envs.Environment]:
+    environment = halgan_envs.pick_and_place_2m(random_state=0)
     yield environment
     environment.close()
 
 
 @pytest.fixture(scope="module")
-def renderer() -> Iterator[envs.GoalRenderer]:
-    renderer = envs.GoalRenderer("pick-and-place-2m")
+def renderer() -> Iterator[halgan_envs.GoalRenderer]:
+    renderer = halgan_envs.GoalRenderer("pick-and-place-2m")
     yield renderer
     renderer.close()
 
@@ -235,7 +234,7 @@ def test_equal_seeds_give_equal_episodes():
 
 
 def run_episode(seed):
-    environment = envs.pick_and_place_2m(random_state=seed)
+    environment = halgan_envs.pick_and_place_2m(random_state=seed)
     actions = np.random.RandomState(0)
     observations = [environment.reset().observation]
     observations += [environment.step(actions.uniform(-1, 1, size=2)).observation for _ in range(10)]
@@ -350,7 +349,7 @@ def test_poses_without_the_flag_are_refused(renderer):
 
 @pytest.fixture(scope="module")
 def near_goal():
-    environment = envs.pick_and_place_2m(random_state=1)
+    environment = halgan_envs.pick_and_place_2m(random_state=1)
     snapshots = collect_near_goal(environment, 300, np.random.RandomState(2), steps_before_goal=40)
     environment.close()
     return snapshots
@@ -399,10 +398,10 @@ def test_failed_snapshots_come_from_both_stages_and_show_the_carried_box(environ
 
 
 def test_the_flag_reaches_torchrl_and_gymnasium():
-    env = envs.make("pick-and-place-2m", seed=0)
+    env = halgan_envs.make("pick-and-place-2m", seed=0)
     assert env.reset()["pose"].shape == env.observation_spec["pose"].shape == (4,)
     env.close()
-    face = envs.GymnasiumEnv("pick-and-place-2m")
+    face = halgan_envs.GymnasiumEnv("pick-and-place-2m")
     observation, info = face.reset(seed=0, options={"pose": [0.1, 0.2, 0.0], "green_box": [0.24, 0.2], "held": 1})
     assert observation["pose"][3] == 1.0
     assert info == {"is_success": False}

@@ -4,9 +4,8 @@ import sys
 
 import numpy as np
 import pytest
-
-from envs import gl_backend
-from envs.rendering import PersistentCamera
+from halgan_envs.rendering import gl_backend
+from halgan_envs.rendering.persistent_camera import PersistentCamera
 
 
 def run_python(code, **variables):
@@ -18,8 +17,8 @@ def run_python(code, **variables):
 @pytest.mark.parametrize("closing", ["", "env.close(); camera.close()"])
 def test_a_process_ends_quietly(closing):
     done = run_python(
-        "import envs; env = envs.make('navigate-2m', seed=0); env.rollout(3); env.render_overview();"
-        f"camera = env.robot.camera; other = envs.GoalRenderer('navigate-2m'); {closing}"
+        "import envs; env = halgan_envs.make('navigate-2m', seed=0); env.rollout(3); env.render_overview();"
+        f"camera = env.robot.camera; other = halgan_envs.GoalRenderer('navigate-2m'); {closing}"
     )
     assert (done.returncode, done.stderr) == (0, "")
 
@@ -31,7 +30,7 @@ def test_an_unknown_backend_is_refused_before_any_work():
 
 
 def test_a_backend_that_is_not_installed_says_what_to_install():
-    done = run_python("import envs; envs.make('navigate-2m')", MUJOCO_GL="osmesa", PYOPENGL_PLATFORM="osmesa")
+    done = run_python("import envs; halgan_envs.make('navigate-2m')", MUJOCO_GL="osmesa", PYOPENGL_PLATFORM="osmesa")
     if done.returncode == 0:
         pytest.skip("OSMesa is installed here.")
     assert "apt-get install" in done.stderr.splitlines()[-1]

@@ -1,8 +1,7 @@
+import halgan_envs
 import numpy as np
 import pytest
-
-import envs
-from envs.robots.rover import Rover, wrap_angle
+from halgan_envs.robots.rover import Rover, wrap_angle
 
 
 def test_full_speed_forward_moves_5_cm_a_step(stage):
@@ -99,7 +98,7 @@ def test_the_robot_does_not_see_itself(stage):
 
 
 def test_others_do_see_the_robot():
-    env = envs.ComposerEnv(envs.navigate_2m(random_state=5))
+    env = halgan_envs.ComposerEnv(halgan_envs.navigate_2m(random_state=5))
     env.reset()
     before = env.render_overview()
     env.robot.set_pose(env.environment.physics, np.array([0.0, 0.0, 1.0]))
@@ -111,7 +110,7 @@ def test_others_do_see_the_robot():
 
 @pytest.mark.parametrize(("reverse_speed", "backward"), [(0.0, 0.0), (0.2, 0.02)])
 def test_the_lowest_action_brakes_or_reverses(reverse_speed, backward):
-    environment = envs.navigate_2m(random_state=0, reverse_speed=reverse_speed)
+    environment = halgan_envs.navigate_2m(random_state=0, reverse_speed=reverse_speed)
     start = environment.reset().observation["pose"]
     environment.step(np.array([-1.0, 0.0]))
     before = environment.step(np.array([-1.0, 0.0])).observation["pose"]

@@ -1,5 +1,6 @@
 import functools
 
+import halgan_envs
 import numpy as np
 import pytest
 import torch
@@ -10,19 +11,17 @@ from torchrl.envs import ParallelEnv
 from torchrl.envs.utils import check_env_specs
 from torchrl.modules import EGreedyModule, QValueActor
 
-import envs
-
 
 @pytest.fixture(scope="module")
 def env():
-    env = envs.make("navigate-2m", seed=0)
+    env = halgan_envs.make("navigate-2m", seed=0)
     yield env
     env.close()
 
 
 @pytest.fixture(scope="module")
 def pebble_env():
-    env = envs.make("pebble", seed=0)
+    env = halgan_envs.make("pebble", seed=0)
     yield env
     env.close()
 
@@ -38,9 +37,9 @@ def act(*action):
     return TensorDict({"action": torch.tensor(action, dtype=torch.float32)}, [])
 
 
-@pytest.mark.parametrize("name", sorted(envs.NAMES))
+@pytest.mark.parametrize("name", sorted(halgan_envs.NAMES))
 def test_every_named_environment_passes_torchrl_s_check(name):
-    env = envs.make(name, seed=0)
+    env = halgan_envs.make(name, seed=0)
     check_env_specs(env)
     env.close()
 
@@ -53,7 +52,7 @@ def test_success_is_terminated_not_truncated(env):
 
 
 def test_the_time_limit_is_truncated_not_terminated():
-    env = envs.make("navigate-2m", seed=0, time_limit=0.5)
+    env = halgan_envs.make("navigate-2m", seed=0, time_limit=0.5)
     out = env.rollout(20)["next"]
     env.close()
     assert len(out) == 5
@@ -74,7 +73,7 @@ def test_set_seed_repeats_everything(env):
 
 
 def test_seeding_at_construction_and_later_is_the_same(env):
-    fresh = envs.make("navigate-2m", seed=11)
+    fresh = halgan_envs.make("navigate-2m", seed=11)
     env.set_seed(11)
     assert torch.equal(fresh.reset()["pose"], env.reset()["pose"])
     fresh.close()
@@ -160,8 +159,8 @@ def test_the_overview_does_not_disturb_the_agent_s_images(env):
 
 
 def test_two_environments_in_one_process_do_not_mix():
-    first, second = envs.make("navigate-2m", seed=1), envs.make("navigate-4m", seed=2)
-    alone = envs.make("navigate-2m", seed=1)
+    first, second = halgan_envs.make("navigate-2m", seed=1), halgan_envs.make("navigate-4m", seed=2)
+    alone = halgan_envs.make("navigate-2m", seed=1)
     expected = alone.reset()["pixels"]
     second.reset()
     image = first.reset()["pixels"]
@@ -171,7 +170,7 @@ def test_two_environments_in_one_process_do_not_mix():
 
 
 def test_it_runs_in_parallel_under_spawn():
-    make = functools.partial(envs.make, "navigate-2m")
+    make = functools.partial(halgan_envs.make, "navigate-2m")
     env = ParallelEnv(2, [functools.partial(make, seed=s) for s in (0, 1)], mp_start_method="spawn")
     try:
         out = env.rollout(4)
@@ -186,7 +185,10 @@ def test_it_runs_in_parallel_under_spawn():
 
 def test_a_collector_resets_it_by_itself():
     collector = Collector(
-        functools.partial(envs.make, "navigate-2m", seed=0, time_limit=0.5), None, frames_per_batch=12, total_frames=12
+        functools.partial(halgan_envs.make, "navigate-2m", seed=0, time_limit=0.5),
+        None,
+        frames_per_batch=12,
+        total_frames=12,
     )
     (batch,) = list(collector)
     collector.shutdown()

@@ -1,9 +1,8 @@
+import halgan_envs
 import mujoco
 import numpy as np
 import pytest
-
-import envs
-from envs.robots.turtlebot import (
+from halgan_envs.robots.turtlebot import (
     BACKWARD,
     BODY_GROUP,
     FAST,
@@ -21,7 +20,7 @@ from envs.robots.turtlebot import (
 
 @pytest.fixture(scope="module")
 def road():
-    environment = envs.find_pebble(random_state=0)
+    environment = halgan_envs.find_pebble(random_state=0)
     environment.reset()
     yield environment
     environment.close()
@@ -84,7 +83,7 @@ def test_a_fast_step_is_16_cm_without_turning(road):
 
 
 def test_with_a_reverse_gear_the_fourth_action_drives_backward():
-    environment = envs.find_pebble(random_state=0, reverse_speed=0.3)
+    environment = halgan_envs.find_pebble(random_state=0, reverse_speed=0.3)
     environment.reset()
     place(environment, 1.0, 0.5, 0.0)
     *_, last, after = poses(environment, *[BACKWARD] * 3)
@@ -126,7 +125,7 @@ def test_it_turns_as_far_as_its_wheels_roll(road):
 
 
 def test_without_friction_it_goes_nowhere():
-    environment = envs.find_pebble(random_state=0)
+    environment = halgan_envs.find_pebble(random_state=0)
     environment.reset()
     environment.physics.model.ptr.geom_friction[:] = 1e-5
     start, *_, end = poses(environment, *[FORWARD] * 8)

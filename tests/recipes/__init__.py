@@ -4,7 +4,7 @@ from contextlib import AbstractContextManager
 from typing import Any
 from unittest import mock
 
-from halgan_rl import experiment
+from halgan_rl.experiment import run as experiment
 
 
 def without_pictures() -> AbstractContextManager[Any]:

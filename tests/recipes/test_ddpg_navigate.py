@@ -11,10 +11,10 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from halgan_rl.experiment import make_hindsight
+from halgan_rl.experiment.presets import parse_config
+from halgan_rl.experiment.run import make_hindsight
+from halgan_rl.experiment.run_folder import read_metrics
 from halgan_rl.poses import PoseTolerance
-from halgan_rl.presets import parse_config
-from halgan_rl.run_folder import read_metrics
 from recipes import play
 from recipes.ddpg_navigate import PRESETS, Config, main
 from tests.recipes import without_pictures
@@ -117,7 +117,7 @@ def test_collection_in_the_background_repeats_itself_a_batch_behind(halgan_run: 
 
 FAILING = """
 import dataclasses, pathlib, sys
-from halgan_rl.training import Agent
+from halgan_rl.training.loop import Agent
 from recipes.ddpg_navigate import main
 from tests.recipes.test_ddpg_navigate import TINY
 
@@ -186,7 +186,7 @@ def test_an_environment_with_other_actions_is_refused(tmp_path: Path) -> None:
 
 
 def test_weights_for_another_room_are_refused_before_the_folder_is_made(tmp_path: Path) -> None:
-    other = Path(__file__).parents[2] / "halgan_rl" / "shipped" / "navigate-4m.safetensors"
+    other = Path(__file__).parents[2] / "halgan_rl" / "hallucination" / "shipped" / "navigate-4m.safetensors"
     with pytest.raises(ValueError, match=r"navigate-4m.*navigate-2m"):
         main(dataclasses.replace(TINY, out=tmp_path / "run", weights=other))
     assert not (tmp_path / "run").exists()

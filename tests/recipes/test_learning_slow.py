@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from halgan_rl.run_folder import read_metrics
+from halgan_rl.experiment.run_folder import read_metrics
 from recipes.ddpg_navigate import Config, main
 
 

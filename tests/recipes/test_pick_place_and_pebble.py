@@ -10,9 +10,9 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from halgan_rl.hindsight_config import HindsightConfig
-from halgan_rl.presets import parse_config
-from halgan_rl.run_folder import read_metrics
+from halgan_rl.experiment.config import HindsightConfig
+from halgan_rl.experiment.presets import parse_config
+from halgan_rl.experiment.run_folder import read_metrics
 from recipes import ddpg_pick_place, ddqn_pebble, play
 from tests.recipes import without_pictures
 

@@ -6,16 +6,16 @@ import math
 from pathlib import Path
 from typing import Any
 
+import halgan_envs
 import pytest
 import torch
 from safetensors.torch import load_file
 
-import envs
-from halgan_rl.gan_training import GanSettings
-from halgan_rl.hallucinators import GanHallucinator
-from halgan_rl.presets import parse_config
-from halgan_rl.run_folder import read_metrics
-from halgan_rl.weights import load_generator
+from halgan_rl.experiment.presets import parse_config
+from halgan_rl.experiment.run_folder import read_metrics
+from halgan_rl.hallucination.hallucinators import GanHallucinator
+from halgan_rl.hallucination.training.adversarial import GanSettings
+from halgan_rl.hallucination.weights import load_generator
 from recipes.train_halgan import PRESETS, Config, main
 
 TINY = dataclasses.replace(
@@ -54,7 +54,7 @@ def test_everything_promised_is_written(run: Path) -> None:
 
 
 def test_the_weights_paint(run: Path) -> None:
-    generator = load_generator(run / "generator.safetensors", expected=envs.fingerprint("navigate-2m"))
+    generator = load_generator(run / "generator.safetensors", expected=halgan_envs.fingerprint("navigate-2m"))
     hallucinate = GanHallucinator(generator, rng=torch.Generator().manual_seed(0))
     pixels = torch.zeros(1, 2, 64, 64, 3, dtype=torch.uint8)
     assert hallucinate(pixels, torch.zeros(1, 2, 3), torch.ones(1, 1, 3)).shape == pixels.shape
@@ -75,14 +75,16 @@ def test_training_ends_when_its_minutes_are_over_and_keeps_what_it_has(tmp_path:
     main(dataclasses.replace(TINY, out=tmp_path / "run", minutes=1e-6, evaluate_every=100))
     metrics = read_metrics(tmp_path / "run" / "metrics.csv")
     assert metrics["steps"] == [1]
-    load_generator(tmp_path / "run" / "generator.safetensors", expected=envs.fingerprint("navigate-2m"))
+    load_generator(tmp_path / "run" / "generator.safetensors", expected=halgan_envs.fingerprint("navigate-2m"))
 
 
 @pytest.mark.parametrize("composition", ["dimming", "difference"])
 def test_the_papers_generator_composes_as_it_is_told(tmp_path: Path, composition: str) -> None:
     changes = {"generator": "paper", "warm_start_steps": 0, "iterations": 1, "composition": composition}
     main(dataclasses.replace(TINY, out=tmp_path / "run", **changes))  # type: ignore[arg-type]
-    generator = load_generator(tmp_path / "run" / "generator.safetensors", expected=envs.fingerprint("navigate-2m"))
+    generator = load_generator(
+        tmp_path / "run" / "generator.safetensors", expected=halgan_envs.fingerprint("navigate-2m")
+    )
     grey = torch.full((1, 3, 64, 64), 0.5)
     assert torch.equal(generator.compose(grey, torch.zeros_like(grey)), grey) == (composition == "difference")
 

@@ -1,0 +1,1 @@
+"""The environments as TorchRL and Gymnasium environments."""

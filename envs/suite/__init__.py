@@ -1,0 +1,1 @@
+"""The named environments: plain functions that put robot, arena and task together."""

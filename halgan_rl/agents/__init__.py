@@ -1,0 +1,1 @@
+"""Agents: the networks, loss, exploration and configuration of one algorithm a file."""

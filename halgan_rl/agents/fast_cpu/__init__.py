@@ -1,0 +1,1 @@
+"""The same agents, computed faster on a CPU."""

@@ -1,0 +1,101 @@
+"""Hallucinators: whatever paints a goal into images."""
+
+import math
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from halgan_rl.hallucination.generators.paper import HallucinationGenerator
+from halgan_rl.transforms.pixels import to_float, to_uint8
+
+
+class Hallucinator(Protocol):
+    """Paints the goal into images as it would be seen from their poses."""
+
+    def __call__(self, pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
+        """Paint one goal into the F images of each of N rows.
+
+        Args:
+            pixels: uint8 ``[N, F, H, W, 3]``; not modified.
+            pose: float ``[N, F, P]``, from where each image was taken.
+            goal_pose: float ``[N, 1, P]``, from where the goal is reached.
+
+        Returns:
+            uint8, of the shape and on the device of ``pixels``.
+        """
+
+
+class GanHallucinator:
+    """Paints goals with a trained generator.
+
+    A plain object, no module: the network's weights stay out of whoever holds it.
+
+    Args:
+        generator: the trained network; its train or eval mode is left as it was found.
+        rng: draws the latents.
+        share_latent: the images of a row share one latent, so that they show one and the same goal.
+        chunk: images of one pass; few keep the activations of a pass in a CPU's cache.
+
+    Raises:
+        ValueError: if poses have another size than those that the network was trained with, or are not finite.
+    """
+
+    def __init__(
+        self, generator: HallucinationGenerator, *, rng: torch.Generator, share_latent: bool = True, chunk: int = 2
+    ) -> None:
+        self._generator, self._rng, self._share_latent, self._chunk = generator, rng, share_latent, chunk
+
+    @torch.no_grad()
+    def __call__(self, pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
+        """Paint the goals, see :class:`Hallucinator`."""
+        check_poses(int(self._generator.arguments["pose_size"]), pose=pose, goal_pose=goal_pose)
+        rows, frames = pixels.shape[:2]
+        features = self._generator.encoding(self._generator.encoding.labels(pose, goal_pose)).flatten(0, 1)
+        repeats = frames if self._share_latent else 1
+        latent = self._generator.sample_latent(rows * frames // repeats, self._rng).repeat_interleave(repeats, 0)
+        was_training = self._generator.training
+        self._generator.eval()
+        parts = zip(*(part.split(self._chunk) for part in (pixels.flatten(0, 1), features, latent)), strict=True)
+        painted = [self._paint(*part) for part in parts]
+        self._generator.train(was_training)
+        return torch.cat(painted).reshape(pixels.shape) if painted else pixels.clone()
+
+    def _paint(self, pixels: Tensor, features: Tensor, latent: Tensor) -> Tensor:
+        return to_uint8(self._generator.compose(to_float(pixels), self._generator(features, latent)))
+
+
+class RandomFlags:
+    """Has a hallucinator paint goals that flags drawn at random select, instead of those of the poses.
+
+    So do the paper's authors in tasks with several goals, in which the flags of a pose tell the one that is pursued.
+
+    Args:
+        hallucinator: paints.
+        rng: draws one setting of the flags for all images of a row.
+    """
+
+    def __init__(self, hallucinator: Hallucinator, *, rng: torch.Generator) -> None:
+        self._hallucinator, self._rng = hallucinator, rng
+
+    def __call__(self, pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
+        """Paint the goals, see :class:`Hallucinator`."""
+        flags = torch.randint(2, (len(pose), 1, pose.shape[-1] - 3), generator=self._rng).to(pose)
+        pose = torch.cat([pose[..., :3], flags.expand(*pose.shape[:-1], -1)], -1)
+        return self._hallucinator(pixels, pose, goal_pose)
+
+
+def check_poses(size: int, **poses: Tensor) -> None:
+    """Refuse poses that a generator trained on poses of ``size`` entries cannot know.
+
+    Raises:
+        ValueError: if poses have another size or are not finite; names them.
+    """
+    for name, value in poses.items():
+        if value.shape[-1] != size:
+            raise ValueError(
+                f"{name} has {value.shape[-1]} entries, but the generator was trained with {size}: "
+                "use weights of an environment with such poses"
+            )
+        if not math.isfinite(value.sum(dtype=torch.float64)):  # several times as fast as looking at each entry
+            raise ValueError(f"{name} holds NaN or infinity: look for it in the rows of the replay buffer")

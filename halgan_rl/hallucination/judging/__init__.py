@@ -1,0 +1,1 @@
+"""How far hallucinations are from the truth."""

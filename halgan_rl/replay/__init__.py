@@ -1,0 +1,1 @@
+"""A replay storage that keeps each frame once."""

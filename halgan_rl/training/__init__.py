@@ -1,0 +1,1 @@
+"""The loop that all agents share, evaluation, and collection beside learning."""

@@ -1,0 +1,114 @@
+from typing import Literal
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from halgan_rl.hallucination.generators.coordinates import CoordinateGenerator
+from halgan_rl.hallucination.generators.paper import Discriminator, HallucinationGenerator, PaperGenerator
+from halgan_rl.hallucination.training.adversarial import GanSettings, HalganTrainer, scott_kernel
+from tests import synthetic
+
+SETTINGS = GanSettings(batch_size=4, critic_steps=1, mirror=True, average_decay=0.9, penalty_interval=2)
+SMALL = GanSettings(batch_size=4, critic_steps=1)
+
+
+def make_trainer(kind: Literal["paper", "coordinates"], settings: GanSettings, seed: int = 0) -> HalganTrainer:
+    torch.manual_seed(0)
+    generator: HallucinationGenerator = (
+        PaperGenerator(latent_size=16) if kind == "paper" else CoordinateGenerator(width=8, depth=1)
+    )
+    return HalganTrainer(
+        generator,
+        Discriminator(generator.encoding.size, first_stride=2),
+        near_goal=synthetic.near_goal(16),
+        failed=synthetic.failed(16),
+        settings=settings,
+        rng=torch.Generator().manual_seed(seed),
+    )
+
+
+def copy(network: nn.Module) -> dict[str, Tensor]:
+    return {name: tensor.detach().clone() for name, tensor in network.named_parameters()}
+
+
+@pytest.mark.parametrize(("kind", "settings"), [("paper", SMALL), ("coordinates", SETTINGS)])
+def test_a_step_changes_every_parameter_of_both_networks(
+    kind: Literal["paper", "coordinates"], settings: GanSettings
+) -> None:
+    trainer = make_trainer(kind, settings)
+    before = copy(trainer.generator), copy(trainer.discriminator)
+    metrics = trainer.step()
+    for old, network in zip(before, (trainer.generator, trainer.discriminator), strict=True):
+        unchanged = [name for name, tensor in network.named_parameters() if torch.equal(tensor, old[name])]
+        # The score's constant cancels in the distance; biases in front of BatchNorm do nothing.
+        assert all("realism.bias" in name or (kind == "paper" and "bias" in name) for name in unchanged)
+    assert all(value.isfinite() for value in metrics.values())
+
+
+def test_equal_seeds_give_equal_weights_and_other_seeds_do_not() -> None:
+    trainers = [make_trainer("coordinates", SETTINGS, seed) for seed in (0, 0, 1)]
+    for trainer in trainers:
+        for _ in range(3):
+            trainer.step()
+    one, same, other = ({**copy(trainer.average), **copy(trainer.discriminator)} for trainer in trainers)
+    assert all(torch.equal(one[name], same[name]) for name in one if name != "realism.bias")
+    assert not any(torch.equal(one[name], other[name]) for name in one if name != "realism.bias")
+
+
+def test_the_average_lags_behind_the_generator_and_a_decay_of_0_keeps_the_last_weights() -> None:
+    lagging, last = make_trainer("coordinates", SETTINGS), make_trainer("coordinates", SMALL)
+    before = copy(lagging.generator)["paint.0.weight"]
+    for trainer in (lagging, last):
+        trainer.step()
+        trainer.step()
+    average, now = (copy(net)["paint.0.weight"] for net in (lagging.average, lagging.generator))
+    assert 0 < (average - before).norm() < (now - before).norm()
+    assert torch.equal(copy(last.average)["paint.0.weight"], copy(last.generator)["paint.0.weight"])
+
+
+def test_a_lazy_penalty_counts_as_much_as_it_is_rarer() -> None:
+    trainer = make_trainer("coordinates", SETTINGS)
+    calls = []
+    penalty = trainer._gradient_penalty
+    trainer._gradient_penalty = lambda *args: calls.append(1) or penalty(*args)  # type: ignore[method-assign, func-returns-value]
+    for _ in range(6):
+        trainer.step()
+    assert len(calls) == 3
+
+
+def test_mirrored_images_come_with_mirrored_labels() -> None:
+    """A bright left half goes with a goal to the left, also in the mirror."""
+    trainer = make_trainer("coordinates", GanSettings(batch_size=32, mirror=True, label_noise=(0.0, 0.0)))
+    trainer._real_pixels = torch.zeros(16, 64, 64, 3, dtype=torch.uint8)
+    trainer._real_pixels[:, :, :32] = 255
+    trainer._labels = torch.tensor([[1.0, 0.5, 0.2]]).expand(16, -1)
+    images, features = trainer._draw_real()
+    left_is_bright = images[:, 0, 0, 0] > 0
+    assert 0 < left_is_bright.sum() < 32
+    assert torch.equal(features[:, 1] > 0, left_is_bright)
+    assert torch.equal(features[:, 2] > 0, left_is_bright)
+
+
+def test_fakes_show_the_goal_that_is_pursued_in_their_failed_frame() -> None:
+    """Failed frames with a red bar below have a flag of 1, and so have the configurations painted into them."""
+    trainer = HalganTrainer(
+        CoordinateGenerator(pose_size=4, opacity=1e-6),
+        Discriminator(5, first_stride=2),
+        near_goal=synthetic.near_goal(16, flagged=True),
+        failed=synthetic.failed(16, flagged=True),
+        settings=GanSettings(batch_size=32),
+        rng=torch.Generator().manual_seed(0),
+    )
+    images, features, _ = trainer._draw_fake()
+    red_below = images[:, 0, 60, 0] > images[:, 1, 60, 0] + 0.5
+    assert 0 < red_below.sum() < 32
+    assert torch.equal(features[:, 4], red_below.float())
+
+
+def test_the_density_of_configurations_is_scotts() -> None:
+    labels = torch.randn(500, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 0.1, 3.0])
+    kernel = scott_kernel(labels)
+    flagged = scott_kernel(torch.cat([labels, torch.arange(500)[:, None] % 2], 1), flags=1)
+    torch.testing.assert_close(flagged, nn.functional.pad(kernel, (0, 1, 0, 1)))
+    torch.testing.assert_close(kernel @ kernel.T, torch.cov(labels.T) * 500 ** (-2 / 7), rtol=1e-3, atol=1e-5)
