@@ -1,10 +1,139 @@
-"""Planar poses: where a goal lies as seen from the robot, and whether it is reached."""
+"""What is done with a pose: its planar part, its flags, where a goal stands, when two poses are the same goal."""
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
+
+
+class Poses(Protocol):
+    """All that replay transforms do with poses. :class:`PlanarPoses` is the library's; write your own for others.
+
+    Poses are float ``[..., P]``; what is in their entries is known here only.
+    """
+
+    def check(self, pose: Tensor, name: str) -> None:
+        """Raises a ``ValueError`` that names ``name`` unless ``pose`` ``[..., P]`` holds poses."""
+
+    def stage_changed(self, pose: Tensor, next_pose: Tensor) -> Tensor:
+        """Returns bool ``[...]``: whether another goal is pursued at ``next_pose`` than at ``pose``."""
+
+    def reached(self, pose: Tensor, goal_pose: Tensor) -> Tensor:
+        """Returns bool ``[...]``: whether ``pose`` *is* the goal pose, within a tolerance. The two broadcast."""
+
+
+@dataclass(frozen=True)
+class PlanarPoses:
+    """Poses in the plane: x [m], y [m], yaw [rad] in the world frame, then the task's flags, each 0 or 1.
+
+    The flags of a pose select the goal that is pursued there: a task with n flags has up to 2^n goals, numbered by
+    :meth:`setting`.
+
+    Attributes:
+        flags: names of the entries after yaw.
+        distance: a pose is the goal pose if it is nearer than this [m] ...
+        angle: ... and turned by less than this [rad]. The defaults are the paper's (Sahni et al. 2019, authors' code).
+        goal_offsets: how far ahead of a goal pose its goal stands [m]: one for each setting of the flags, or one for all.
+
+    Raises:
+        ValueError: if a tolerance is not positive, an offset negative, or there are offsets for other settings.
+
+    Examples:
+        >>> poses = PlanarPoses(flags=("held",), goal_offsets=(0.1, 0.2))
+        >>> here, there = torch.tensor([0.0, 0.0, 0.0, 1.0]), torch.tensor([1.0, 1.0, math.pi / 2, 0.0])
+        >>> poses.goal_position(here, there).round(decimals=3).tolist()  # 0.2 m ahead, for the robot holds the box
+        [1.0, 1.2]
+    """
+
+    flags: tuple[str, ...] = ()
+    distance: float = 0.01
+    angle: float = 0.1
+    goal_offsets: tuple[float, ...] = (0.0,)
+
+    def __post_init__(self) -> None:
+        """Refuses values that make no sense."""
+        for name in ("distance", "angle"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
+        if min(self.goal_offsets, default=-1.0) < 0:
+            raise ValueError(f"goal_offsets={self.goal_offsets} m must not be negative: the goal stands ahead.")
+        if len(self.goal_offsets) not in (1, self.settings):
+            raise ValueError(
+                f"goal_offsets={self.goal_offsets} has {len(self.goal_offsets)} entries, but the flags {self.flags} "
+                f"have {self.settings} settings: give one for each, or one for all."
+            )
+
+    @property
+    def size(self) -> int:
+        """Entries of a pose, P."""
+        return 3 + len(self.flags)
+
+    @property
+    def settings(self) -> int:
+        """Settings of the flags."""
+        return 2 ** len(self.flags)
+
+    def check(self, pose: Tensor, name: str) -> None:
+        """Raises a ``ValueError`` that names ``name`` unless all of ``pose`` ``[..., P]`` are such poses."""
+        names = ", ".join(("x [m]", "y [m]", "yaw [rad]", *self.flags))
+        if not pose.ndim or pose.shape[-1] != self.size or not pose.is_floating_point():
+            raise ValueError(
+                f"{name} is {pose.dtype} {tuple(pose.shape)}; its last dimension must hold {self.size} floats: {names}. "
+                "Name flags that follow in PlanarPoses(flags=(...)); for other poses give a poses object of your own "
+                "(halgan_rl.poses.Poses)."
+            )
+        if not torch.isfinite(pose).all():
+            bad = pose.reshape(-1, self.size)[~torch.isfinite(pose).all(-1).flatten()][0]
+            raise ValueError(f"{name} is not finite: {short(bad)}. Mend the pose observation.")
+        flags = self.flag_part(pose)
+        wrong = ((flags != 0) & (flags != 1)).any(-1)
+        if wrong.any():
+            bad = pose.reshape(-1, self.size)[wrong.flatten()][0]
+            raise ValueError(
+                f"{name} holds {short(bad)}, but its flags ({', '.join(self.flags)}) must be 0 or 1: pass numbers that "
+                "are no flags under another key, or give a poses object of your own (halgan_rl.poses.Poses)."
+            )
+
+    def flag_part(self, pose: Tensor) -> Tensor:
+        """Returns the flags ``[..., P - 3]`` of poses ``[..., P]``."""
+        return pose[..., 3:]
+
+    def setting(self, pose: Tensor) -> Tensor:
+        """Numbers the setting of the flags of poses ``[..., P]``, int64 ``[...]``: the first flag is the lowest bit.
+
+        Examples:
+            >>> poses = PlanarPoses(flags=("held",))
+            >>> poses.setting(torch.tensor([[0.5, 0.5, 0.0, 1.0], [0.5, 0.5, 0.0, 0.0]])).tolist()
+            [1, 0]
+        """
+        return flag_number(pose)
+
+    def stage_changed(self, pose: Tensor, next_pose: Tensor) -> Tensor:
+        """Returns bool ``[...]``: whether a flag differs, so that another goal is pursued."""
+        return (self.flag_part(pose) != self.flag_part(next_pose)).any(-1)
+
+    def reached(self, pose: Tensor, goal_pose: Tensor) -> Tensor:
+        """Returns bool ``[...]``: whether ``pose`` is within both tolerances of ``goal_pose``; flags do not count."""
+        x, y, yaw = (goal_pose[..., :3] - pose[..., :3]).unbind(-1)
+        return (torch.hypot(x, y) < self.distance) & (wrap_angle(yaw).abs() < self.angle)
+
+    def goal_offset(self, pose: Tensor) -> Tensor:
+        """Returns how far ahead of its goal pose the goal stands that is pursued at poses ``[..., P]``, ``[...]`` [m]."""
+        offsets = torch.tensor(self.goal_offsets, device=pose.device).expand(self.settings)
+        return offsets[self.setting(pose)]
+
+    def goal_position(self, pose: Tensor, goal_pose: Tensor) -> Tensor:
+        """Returns where the goal stands that is pursued at ``pose`` and reached at ``goal_pose``, ``[..., 2]`` [m]."""
+        offset = self.goal_offset(pose)
+        x, y, yaw = goal_pose[..., :3].unbind(-1)
+        return torch.stack([x + offset * yaw.cos(), y + offset * yaw.sin()], -1)
+
+    def goal_polar(self, pose: Tensor, goal_pose: Tensor) -> Tensor:
+        """Returns bearing [rad, positive is left] and distance [m] of the goal as seen from ``pose``, ``[..., 2]``."""
+        x, y = (self.goal_position(pose, goal_pose) - pose[..., :2]).unbind(-1)
+        return torch.stack([wrap_angle(torch.atan2(y, x) - pose[..., 2]), torch.hypot(x, y)], -1)
 
 
 def relative_pose(pose: Tensor, goal_pose: Tensor) -> Tensor:
@@ -12,21 +141,16 @@ def relative_pose(pose: Tensor, goal_pose: Tensor) -> Tensor:
 
     Args:
         pose: ``[..., P]``, its first three entries x [m], y [m], yaw [rad] in the world frame.
-        goal_pose: ``[..., P]`` likewise; broadcasts against ``pose``. Entries after the third (task flags) are ignored.
+        goal_pose: ``[..., P]`` likewise; broadcasts against ``pose``. Entries after the third are ignored.
 
     Returns:
         ``[..., 3]``: metres ahead, metres to the left, and the yaw difference in radians, wrapped to (-pi, pi].
-
-    Raises:
-        ValueError: If either pose has fewer than three entries.
 
     Examples:
         >>> facing_north = torch.tensor([1.0, 0.0, math.pi / 2])
         >>> relative_pose(facing_north, torch.tensor([1.0, 2.0, math.pi / 2])).round(decimals=3).tolist()
         [2.0, -0.0, 0.0]
     """
-    check_pose_size(pose, "pose")
-    check_pose_size(goal_pose, "goal_pose")
     difference = goal_pose[..., :3] - pose[..., :3]
     x, y, yaw = difference.unbind(-1)
     cos, sin = pose[..., 2].cos(), pose[..., 2].sin()
@@ -39,55 +163,10 @@ def wrap_angle(angle: Tensor) -> Tensor:
 
 
 def flag_number(pose: Tensor) -> Tensor:
-    """Numbers the setting of the task flags of poses ``[..., P]``, int64 ``[...]``: the first flag is the lowest bit.
-
-    Examples:
-        >>> flag_number(torch.tensor([[0.5, 0.5, 0.0, 1.0], [0.5, 0.5, 0.0, 0.0]])).tolist()
-        [1, 0]
-    """
+    """Numbers the setting of the flags of planar poses ``[..., P]``, int64 ``[...]``: the first is the lowest bit."""
     return ((pose[..., 3:] > 0.5) * 2 ** torch.arange(pose.shape[-1] - 3, device=pose.device)).sum(-1)
 
 
-def check_pose_size(pose: Tensor, name: str) -> None:
-    """Raises a ``ValueError`` that names ``name`` unless ``pose`` is ``[..., P]`` with P >= 3."""
-    if pose.ndim < 1 or pose.shape[-1] < 3:
-        raise ValueError(
-            f"{name} has shape {tuple(pose.shape)}; its last dimension must hold at least x [m], y [m] and yaw [rad]."
-        )
-
-
-@dataclass(frozen=True)
-class PoseTolerance:
-    """Says whether a pose *is* the goal pose: nearer than a distance and turned by less than an angle.
-
-    The defaults are the paper's thresholds for a goal reached in hindsight. Task flags are not compared.
-
-    Attributes:
-        distance: Largest distance, exclusive, in metres.
-        angle: Largest yaw difference, exclusive, in radians.
-    """
-
-    distance: float = 0.01
-    angle: float = 0.1
-
-    def __post_init__(self) -> None:
-        """Refuses tolerances that nothing can meet."""
-        for name in ("distance", "angle"):
-            value = getattr(self, name)
-            if not value > 0:
-                raise ValueError(f"{name} must be positive, got {value}.")
-
-    def __call__(self, pose: Tensor, goal_pose: Tensor) -> Tensor:
-        """Compares poses.
-
-        Args:
-            pose: ``[..., P]``, x [m], y [m], yaw [rad], flags.
-            goal_pose: ``[..., P]`` likewise; broadcasts against ``pose``.
-
-        Returns:
-            Bool ``[...]``: whether ``pose`` is within both tolerances of ``goal_pose``.
-        """
-        check_pose_size(pose, "pose")
-        check_pose_size(goal_pose, "goal_pose")
-        x, y, yaw = (goal_pose[..., :3] - pose[..., :3]).unbind(-1)
-        return (torch.hypot(x, y) < self.distance) & (wrap_angle(yaw).abs() < self.angle)
+def short(pose: Tensor) -> list[float]:
+    """Writes a pose for people."""
+    return [round(number, 4) for number in pose.tolist()]
