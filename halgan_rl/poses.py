@@ -35,7 +35,7 @@ class PlanarPoses:
         flags: names of the entries after yaw.
         distance: a pose is the goal pose if it is nearer than this [m] ...
         angle: ... and turned by less than this [rad]. The defaults are the paper's (Sahni et al. 2019, authors' code).
-        goal_offsets: how far ahead of a goal pose its goal stands [m]: one for each setting of the flags, or one for all.
+        goal_offsets: how far ahead of a goal pose its goal stands [m]: for each setting of the flags, or one for all.
 
     Raises:
         ValueError: if a tolerance is not positive, an offset negative, or there are offsets for other settings.
@@ -80,8 +80,8 @@ class PlanarPoses:
         names = ", ".join(("x [m]", "y [m]", "yaw [rad]", *self.flags))
         if not pose.ndim or pose.shape[-1] != self.size or not pose.is_floating_point():
             raise ValueError(
-                f"{name} is {pose.dtype} {tuple(pose.shape)}; its last dimension must hold {self.size} floats: {names}. "
-                "Name flags that follow in PlanarPoses(flags=(...)); for other poses give a poses object of your own "
+                f"{name} is {pose.dtype} {tuple(pose.shape)}; its last dimension must hold {self.size} floats: "
+                f"{names}. Name flags that follow in PlanarPoses(flags=(...)); for other poses give a poses object of your own "
                 "(halgan_rl.poses.Poses)."
             )
         if not torch.isfinite(pose).all():
@@ -120,7 +120,7 @@ class PlanarPoses:
         return (torch.hypot(x, y) < self.distance) & (wrap_angle(yaw).abs() < self.angle)
 
     def goal_offset(self, pose: Tensor) -> Tensor:
-        """Returns how far ahead of its goal pose the goal stands that is pursued at poses ``[..., P]``, ``[...]`` [m]."""
+        """Returns how far ahead of its goal pose the goal pursued at poses ``[..., P]`` stands, ``[...]`` [m]."""
         offsets = torch.tensor(self.goal_offsets, device=pose.device).expand(self.settings)
         return offsets[self.setting(pose)]
 

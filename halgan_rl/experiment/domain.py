@@ -25,7 +25,7 @@ class Domain:
     name: str
     """Names the environment in folders, pictures and manifests."""
     make: Callable[..., EnvBase]
-    """``make(seed=...)`` makes the environment; it must pickle: a function at the top of a module, or a partial of one."""
+    """``make(seed=...)`` makes the environment; it must pickle: a function of a module, or a partial of one."""
     action_spec: TensorSpec
     """Actions of the environment: ``Bounded`` ``[A]``, or ``OneHot`` ``[A]``."""
     image_shape: tuple[int, int, int] = (64, 64, 3)
@@ -37,11 +37,11 @@ class Domain:
     keys: Keys = field(default_factory=Keys)
     """Where the environment writes what."""
     fingerprint: Mapping[str, str] = field(default_factory=dict)
-    """What the images depend on, such as versions and the hash of a golden frame: stamped into weights, and compared."""
+    """What the images depend on, such as versions and the hash of a golden frame: stamped into weights."""
     goal_renderer: Callable[[], Hallucinator] | None = None
     """Returns an oracle that paints the goal as the simulator shows it; None if there is none."""
     overview: Callable[[EnvBase, int, int], np.ndarray] | None = None
-    """``overview(env, height, width)`` returns a picture for people, uint8 ``[height, width, 3]``; None if there is none."""
+    """``overview(env, height, width)`` returns a picture for people, uint8 ``[height, width, 3]``; or None."""
 
     def __post_init__(self) -> None:
         """Refuses what is no image shape."""

@@ -1,29 +1,13 @@
 """Hallucinators: whatever paints a goal into images."""
 
 import math
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from halgan_rl.hallucination.generators.paper import HallucinationGenerator
+from halgan_rl.transforms.hallucinate_goal import Hallucinator
 from halgan_rl.transforms.pixels import to_float, to_uint8
-
-
-class Hallucinator(Protocol):
-    """Paints the goal into images as it would be seen from their poses."""
-
-    def __call__(self, pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
-        """Paint one goal into the F images of each of N rows.
-
-        Args:
-            pixels: uint8 ``[N, F, H, W, 3]``; not modified.
-            pose: float ``[N, F, P]``, from where each image was taken.
-            goal_pose: float ``[N, 1, P]``, from where the goal is reached.
-
-        Returns:
-            uint8, of the shape and on the device of ``pixels``.
-        """
 
 
 class GanHallucinator:

@@ -2,13 +2,14 @@
 
 from halgan_rl.transforms.base import ReplayTransform
 from halgan_rl.transforms.draw_hindsight_goal import DrawHindsightGoal
-from halgan_rl.transforms.hallucinate_goal import HallucinateGoal
+from halgan_rl.transforms.hallucinate_goal import HallucinateGoal, Hallucinator
 from halgan_rl.transforms.hindsight_reward import HindsightReward
 from halgan_rl.transforms.stamp_future_poses import StampFuturePoses
 
 __all__ = [
     "DrawHindsightGoal",
     "HallucinateGoal",
+    "Hallucinator",
     "HindsightReward",
     "ReplayTransform",
     "StampFuturePoses",

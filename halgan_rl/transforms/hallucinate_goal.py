@@ -1,8 +1,6 @@
 """The second step of the sample path: painting the goal into the images."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -11,12 +9,24 @@ from torch import Tensor
 from halgan_rl.transforms.base import ReplayTransform, next_key
 from halgan_rl.transforms.rows import replace_rows
 
-if TYPE_CHECKING:
-    from halgan_rl.hallucination.hallucinators import Hallucinator
-
-
 SEEN = 16
 """How much some value of an image must change for the goal to be seen; shipped generators' blur seldom changes more."""
+
+
+class Hallucinator(Protocol):
+    """Paints the goal into images as it would be seen from their poses."""
+
+    def __call__(self, pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
+        """Paint one goal into the F images of each of N rows.
+
+        Args:
+            pixels: uint8 ``[N, F, H, W, C]``; not modified.
+            pose: float ``[N, F, P]``, from where each image was taken.
+            goal_pose: float ``[N, 1, P]``, from where the goal is reached.
+
+        Returns:
+            uint8, of the shape and on the device of ``pixels``.
+        """
 
 
 class HallucinateGoal(ReplayTransform):

@@ -4,19 +4,14 @@ Each is a plain function that returns a :class:`torchrl.envs.Compose`; its membe
 ``pipeline[1].step(frames)`` to anneal the share of relabelled rows.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from tensordict import NestedKey
 from torchrl.envs import Compose
 
 from halgan_rl.poses import PoseTolerance
-from halgan_rl.transforms import DrawHindsightGoal, HallucinateGoal, HindsightReward, StampFuturePoses
-
-if TYPE_CHECKING:
-    from halgan_rl.hallucination.hallucinators import Hallucinator
+from halgan_rl.transforms import DrawHindsightGoal, HallucinateGoal, Hallucinator, HindsightReward, StampFuturePoses
 
 
 def halgan(
