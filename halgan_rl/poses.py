@@ -81,8 +81,8 @@ class PlanarPoses:
         if not pose.ndim or pose.shape[-1] != self.size or not pose.is_floating_point():
             raise ValueError(
                 f"{name} is {pose.dtype} {tuple(pose.shape)}; its last dimension must hold {self.size} floats: "
-                f"{names}. Name flags that follow in PlanarPoses(flags=(...)); for other poses give a poses object of your own "
-                "(halgan_rl.poses.Poses)."
+                f"{names}. Name flags that follow in PlanarPoses(flags=(...)); for other poses give an object of your "
+                "own (halgan_rl.poses.Poses)."
             )
         if not torch.isfinite(pose).all():
             bad = pose.reshape(-1, self.size)[~torch.isfinite(pose).all(-1).flatten()][0]

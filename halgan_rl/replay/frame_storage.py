@@ -14,10 +14,10 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.data import LazyTensorStorage
 
+from halgan_rl.keys import dotted, next_key
 from halgan_rl.replay.frame_checkpointer import FrameStorageCheckpointer
 from halgan_rl.replay.frame_table import OVERHEAD, FrameTable, FrameTableFullError, gather
 from halgan_rl.replay.free_room import check_room, readable
-from halgan_rl.transforms.base import dotted, next_key
 
 _LOGGER = logging.getLogger(__name__)
 

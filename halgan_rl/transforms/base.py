@@ -1,18 +1,27 @@
 """What all hindsight transforms share: they live in replay buffers only and never modify what is stored there."""
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
+
+from halgan_rl.keys import Keys, dotted
 
 
 class ReplayTransform(Transform):
     """A transform of sampled rows: write :meth:`_edit_rows` and every property below holds.
 
     It refuses environments, records no gradients and never modifies the storage; an entry that is missing is reported
-    with the constructor argument that named its key.
+    with the field of ``keys`` that named its key.
+
+    Args:
+        keys: where the rows keep what.
     """
+
+    def __init__(self, keys: Keys) -> None:
+        super().__init__()
+        self.keys = keys
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -37,23 +46,18 @@ class ReplayTransform(Transform):
                 "Append it to a replay buffer instead: replay_buffer.append_transform(transform)."
             )
 
-    def _read(self, tensordict: TensorDictBase, key: NestedKey, argument: str) -> Tensor:
-        """Returns the entry at ``key``; ``argument`` is the constructor argument that chose it."""
+    def _read(self, tensordict: TensorDictBase, name: str, key: NestedKey | None = None) -> Tensor:
+        """Returns the entry at the key of the field ``name`` of ``keys``, or at ``key``, which derives from it."""
+        key = getattr(self.keys, name) if key is None else key
         value = tensordict.get(key, None)
         if value is None:
             present = ", ".join(sorted(map(dotted, tensordict.keys(True, True))))
             raise KeyError(
-                f"{type(self).__name__} misses the key {dotted(key)}, set by the constructor argument "
-                f"{argument}={getattr(self, argument)!r}. The rows hold {present}."
+                f"{type(self).__name__} misses the key {dotted(key)}, set by "
+                f"keys=Keys({name}={getattr(self.keys, name)!r}). The rows hold {present}."
             )
         return value
 
-
-def dotted(key: NestedKey) -> str:
-    """Writes a key for people: ``next.pose``."""
-    return key if isinstance(key, str) else ".".join(key)
-
-
-def next_key(key: NestedKey) -> NestedKey:
-    """Returns the key of the same entry one step later: ``("next", *key)``."""
-    return unravel_key(("next", key))
+    def _read_next(self, tensordict: TensorDictBase, name: str) -> Tensor:
+        """Returns the entry of the field ``name`` of ``keys`` one step later."""
+        return self._read(tensordict, name, self.keys.next(name))

@@ -3,10 +3,12 @@
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import TensorDictBase
 from torch import Tensor
 
-from halgan_rl.poses import PoseTolerance
+from halgan_rl.keys import Keys
+from halgan_rl.poses import PlanarPoses, Poses
+from halgan_rl.transforms.annealing import Annealing
 from halgan_rl.transforms.base import ReplayTransform
 
 
@@ -21,23 +23,19 @@ class DrawHindsightGoal(ReplayTransform):
     number of frames collected. It and the generator's state are part of ``state_dict()``.
 
     Args:
-        probability: Share of rows to relabel at first, in [0, 1].
-        final_probability: That share after ``annealing_steps`` frames, in [0, 1].
-        annealing_steps: Frames, as counted by :meth:`step`, from the one to the other.
+        probability: Fraction of rows to relabel, in [0, 1], by the frames that :meth:`step` has counted.
 
     Keyword Args:
-        generator: The source of all randomness here. With ``prefetch`` its draws are not reproducible; to
-            ``torch.compile`` a generator is opaque, so compile the transforms after this one.
+        rng: The source of all randomness here. With ``prefetch`` its draws are not reproducible; to ``torch.compile``
+            a generator is opaque, so compile the transforms after this one.
         nearness: Preference k >= 1 for near goals: d is 1 + floor(horizon * u^k), u uniform in [0, 1). 1 is uniform, as
             in the paper; with 2 and a horizon of 32, the next pose is the goal 6 times as often.
-        tolerance: When a row already stands at its goal; None relabels such rows too.
-        pose_key: Pose ``[P]`` of the row.
-        hindsight_key: Where :class:`~halgan_rl.transforms.StampFuturePoses` wrote ``"pose"`` and ``"horizon"``.
-        goal_key: Where ``"mask"`` ``[1]`` bool and ``"pose"`` ``[P]`` are written; the pose means nothing where the
-            mask is False.
+        skip_reached: Whether rows that already are at their goal are left alone.
+        poses: When a pose is the goal pose.
+        keys: Where rows keep what. The goal's pose means nothing where its mask is False.
 
     Raises:
-        ValueError: If a probability is outside [0, 1], or ``annealing_steps`` or ``nearness`` is less than 1.
+        ValueError: If a probability is outside [0, 1], or ``nearness`` is less than 1.
         KeyError: On sampling, if a row lacks a key; names the key and the argument that set it.
 
     Examples:
@@ -45,46 +43,40 @@ class DrawHindsightGoal(ReplayTransform):
         >>> futures = torch.arange(1.0, 4.0)[:, None] * torch.tensor([1.0, 0.0, 0.0])
         >>> hindsight = {"pose": futures.expand(2, 3, 3), "horizon": torch.tensor([[3], [0]])}
         >>> rows = TensorDict({"pose": torch.zeros(2, 3), "hindsight": hindsight}, batch_size=[2])
-        >>> rows = DrawHindsightGoal(1.0, generator=torch.Generator().manual_seed(0))(rows)
+        >>> rows = DrawHindsightGoal(Annealing(1.0, 1.0, 1), rng=torch.Generator().manual_seed(0))(rows)
         >>> rows["goal", "mask"].tolist()
         [[True], [False]]
     """
 
-    probability: Tensor
     frames: Tensor
 
     def __init__(
         self,
-        probability: float = 0.3,
-        final_probability: float = 0.0,
-        annealing_steps: int = 60_000,
+        probability: Annealing = Annealing(0.3, 0.0, 60_000),  # noqa: B008 (frozen)
         *,
-        generator: torch.Generator,
+        rng: torch.Generator,
         nearness: float = 1.0,
-        tolerance: PoseTolerance | None = PoseTolerance(),  # noqa: B008 (frozen)
-        pose_key: NestedKey = "pose",
-        hindsight_key: NestedKey = "hindsight",
-        goal_key: NestedKey = "goal",
+        skip_reached: bool = True,
+        poses: Poses = PlanarPoses(),  # noqa: B008 (frozen)
+        keys: Keys = Keys(),  # noqa: B008 (frozen)
     ) -> None:
-        super().__init__()
-        for name, value in (("probability", probability), ("final_probability", final_probability)):
-            if not 0.0 <= value <= 1.0:
-                raise ValueError(f"{name} must lie in [0, 1], got {value}.")
-        if annealing_steps < 1:
-            raise ValueError(f"annealing_steps must be at least 1 frame, got {annealing_steps}.")
-        self.initial_probability = probability
-        self.final_probability = final_probability
-        self.annealing_steps = annealing_steps
-        self.generator = generator
+        super().__init__(keys)
+        for name in ("start", "end"):
+            if not 0.0 <= getattr(probability, name) <= 1.0:
+                raise ValueError(f"probability.{name} must lie in [0, 1], got {getattr(probability, name)}.")
         if not nearness >= 1.0:
             raise ValueError(f"nearness must be at least 1, got {nearness}.")
+        self.annealing = probability
+        self.rng = rng
         self.nearness = nearness
-        self.tolerance = tolerance
-        self.pose_key = pose_key
-        self.hindsight_key = hindsight_key
-        self.goal_key = goal_key
-        self.register_buffer("probability", torch.tensor(float(probability)))
+        self.skip_reached = skip_reached
+        self.poses = poses
         self.register_buffer("frames", torch.tensor(0))
+
+    @property
+    def probability(self) -> float:
+        """The present fraction of rows to relabel."""
+        return self.annealing.at(int(self.frames))
 
     def step(self, frames: int = 1) -> None:
         """Anneals the probability.
@@ -93,29 +85,27 @@ class DrawHindsightGoal(ReplayTransform):
             frames: Frames collected since the last call.
         """
         self.frames += frames
-        done = (self.frames / self.annealing_steps).clamp(max=1.0)
-        self.probability.copy_(torch.lerp(*self._endpoints(), done))
 
     def _edit_rows(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Adds the goal's mask and pose to sampled rows ``[...]``."""
-        pose = self._read(tensordict, self.pose_key, "pose_key")
-        futures = self._read(tensordict, unravel_key((self.hindsight_key, "pose")), "hindsight_key")
-        horizon = self._read(tensordict, unravel_key((self.hindsight_key, "horizon")), "hindsight_key")
+        pose = self._read(tensordict, "pose")
+        futures = self._read(tensordict, "hindsight", self.keys.hindsight_pose)
+        horizon = self._read(tensordict, "hindsight", self.keys.hindsight_horizon)
         goal_pose = self._draw_pose(futures, horizon)
         mask = (self._uniform(horizon) < self.probability) & (horizon > 0)
-        if self.tolerance is not None:
-            mask = mask & ~self.tolerance(pose, goal_pose).unsqueeze(-1)
-        tensordict.set(unravel_key((self.goal_key, "mask")), mask)
-        tensordict.set(unravel_key((self.goal_key, "pose")), goal_pose)
+        if self.skip_reached:
+            mask = mask & ~self.poses.reached(pose, goal_pose).unsqueeze(-1)
+        tensordict.set(self.keys.goal_mask, mask)
+        tensordict.set(self.keys.goal_pose, goal_pose)
         return tensordict
 
     def get_extra_state(self) -> dict[str, Any]:
         """Returns the generator's state."""
-        return {"generator": self.generator.get_state()}
+        return {"rng": self.rng.get_state()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`get_extra_state` returned."""
-        self.generator.set_state(state["generator"].cpu())
+        self.rng.set_state(state["rng"].cpu())
 
     def _draw_pose(self, futures: Tensor, horizon: Tensor) -> Tensor:
         """Picks one of the first ``horizon`` poses ``[..., D, P]``: ``[..., P]``."""
@@ -125,8 +115,4 @@ class DrawHindsightGoal(ReplayTransform):
 
     def _uniform(self, like: Tensor) -> Tensor:
         """Draws from [0, 1), one number for each entry of ``like``."""
-        return torch.rand(like.shape, generator=self.generator, device=self.generator.device).to(like.device)
-
-    def _endpoints(self) -> tuple[Tensor, Tensor]:
-        new = self.probability.new_tensor
-        return new(self.initial_probability), new(self.final_probability)
+        return torch.rand(like.shape, generator=self.rng, device=self.rng.device).to(like.device)

@@ -3,10 +3,11 @@
 from typing import Protocol
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import TensorDictBase
 from torch import Tensor
 
-from halgan_rl.transforms.base import ReplayTransform, next_key
+from halgan_rl.keys import Keys
+from halgan_rl.transforms.base import ReplayTransform
 from halgan_rl.transforms.rows import replace_rows
 
 SEEN = 16
@@ -50,12 +51,10 @@ class HallucinateGoal(ReplayTransform):
         hallucinator: Maps pixels uint8 ``[N, 2, H, W, 3]``, pose ``[N, 2, P]`` and goal pose ``[N, 1, P]`` to pixels.
 
     Keyword Args:
-        pixels_key: Images uint8 ``[H, W, 3]``, at the root and under ``"next"``.
-        pose_key: Poses ``[P]``, at the root and under ``"next"``.
-        goal_key: Where :class:`~halgan_rl.transforms.DrawHindsightGoal` wrote ``"mask"`` and ``"pose"``.
         pursue_unseen: Whether rows stay relabelled whose image at t does not show the goal, as in the paper. Seen is a
             goal for which some value changes by more than ``SEEN`` of 255, so not one of its background's colour.
         fixed_shape: Whether to hallucinate all rows, so that no shape depends on the data.
+        keys: Where rows keep what.
 
     Raises:
         TypeError: If the hallucinator is not callable.
@@ -79,39 +78,30 @@ class HallucinateGoal(ReplayTransform):
         self,
         hallucinator: Hallucinator,
         *,
-        pixels_key: NestedKey = "pixels",
-        pose_key: NestedKey = "pose",
-        goal_key: NestedKey = "goal",
         pursue_unseen: bool = True,
         fixed_shape: bool = False,
+        keys: Keys = Keys(),  # noqa: B008 (frozen)
     ) -> None:
-        super().__init__()
+        super().__init__(keys)
         if not callable(hallucinator):
             raise TypeError(f"hallucinator must be callable on (pixels, pose, goal_pose), got {hallucinator!r}.")
         self.__dict__["hallucinator"] = hallucinator  # past nn.Module, which would register it
-        self.pixels_key = pixels_key
-        self.pose_key = pose_key
-        self.goal_key = goal_key
         self.pursue_unseen = pursue_unseen
         self.fixed_shape = fixed_shape
 
     def _edit_rows(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Paints the goal into the images of relabelled rows ``[...]``."""
-        mask = self._read(tensordict, unravel_key((self.goal_key, "mask")), "goal_key")
-        goal_pose = self._read(tensordict, unravel_key((self.goal_key, "pose")), "goal_key")
-        pose = self._read_both(tensordict, self.pose_key, "pose_key")
-        pixels = self._read_both(tensordict, self.pixels_key, "pixels_key")
+        mask = self._read(tensordict, "goal", self.keys.goal_mask)
+        goal_pose = self._read(tensordict, "goal", self.keys.goal_pose)
+        pose = self._read(tensordict, "pose"), self._read_next(tensordict, "pose")
+        pixels = self._read(tensordict, "pixels"), self._read_next(tensordict, "pixels")
         edit = self._edit_all if self.fixed_shape else self._edit_masked
         rows = (entry.reshape(-1, *entry.shape[tensordict.batch_dims :]) for entry in (*pixels, *pose, goal_pose))
         relabelled, *edited = edit(mask.flatten(), *rows)
-        tensordict.set(unravel_key((self.goal_key, "mask")), relabelled.reshape(mask.shape))
-        for key, before, after in zip((self.pixels_key, next_key(self.pixels_key)), pixels, edited, strict=True):
+        tensordict.set(self.keys.goal_mask, relabelled.reshape(mask.shape))
+        for key, before, after in zip((self.keys.pixels, self.keys.next("pixels")), pixels, edited, strict=True):
             tensordict.set(key, after.reshape(before.shape))
         return tensordict
-
-    def _read_both(self, tensordict: TensorDictBase, key: NestedKey, argument: str) -> tuple[Tensor, Tensor]:
-        """Returns an entry at t and at t+1."""
-        return self._read(tensordict, key, argument), self._read(tensordict, next_key(key), argument)
 
     def _edit_masked(
         self, mask: Tensor, pixels: Tensor, next_pixels: Tensor, *poses: Tensor

@@ -1,10 +1,11 @@
 """The last step of the sample path: the reward of having reached the goal."""
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import TensorDictBase
 
-from halgan_rl.poses import PoseTolerance
-from halgan_rl.transforms.base import ReplayTransform, next_key
+from halgan_rl.keys import Keys
+from halgan_rl.poses import PlanarPoses, Poses
+from halgan_rl.transforms.base import ReplayTransform
 
 
 class HindsightReward(ReplayTransform):
@@ -19,13 +20,8 @@ class HindsightReward(ReplayTransform):
 
     Keyword Args:
         success_reward: Added to the row's own reward, which may hold an energy cost.
-        tolerance: When a pose is the goal pose.
-        pose_key: Pose ``[P]``, read under ``"next"``.
-        goal_key: Where :class:`~halgan_rl.transforms.DrawHindsightGoal` wrote ``"mask"`` and ``"pose"``.
-        reward_key: Reward ``[1]``, under ``"next"``.
-        done_key: End-of-episode flag ``[1]``, under ``"next"``.
-        terminated_key: Termination flag ``[1]``, under ``"next"``.
-        truncated_key: Time-limit flag ``[1]``, under ``"next"``.
+        poses: When a pose is the goal pose.
+        keys: Where rows keep what.
 
     Raises:
         KeyError: On sampling, if a row lacks a key; names the key and the argument that set it.
@@ -44,37 +40,27 @@ class HindsightReward(ReplayTransform):
         self,
         *,
         success_reward: float = 1.0,
-        tolerance: PoseTolerance = PoseTolerance(),  # noqa: B008 (frozen)
-        pose_key: NestedKey = "pose",
-        goal_key: NestedKey = "goal",
-        reward_key: NestedKey = "reward",
-        done_key: NestedKey = "done",
-        terminated_key: NestedKey = "terminated",
-        truncated_key: NestedKey = "truncated",
+        poses: Poses = PlanarPoses(),  # noqa: B008 (frozen)
+        keys: Keys = Keys(),  # noqa: B008 (frozen)
     ) -> None:
-        super().__init__()
+        super().__init__(keys)
         self.success_reward = success_reward
-        self.tolerance = tolerance
-        self.pose_key = pose_key
-        self.goal_key = goal_key
-        self.reward_key = reward_key
-        self.done_key = done_key
-        self.terminated_key = terminated_key
-        self.truncated_key = truncated_key
+        self.poses = poses
 
     def _edit_rows(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Rewrites reward and flags of sampled rows ``[...]``."""
-        mask = self._read(tensordict, unravel_key((self.goal_key, "mask")), "goal_key")
-        goal_pose = self._read(tensordict, unravel_key((self.goal_key, "pose")), "goal_key")
-        next_pose = self._read(tensordict, next_key(self.pose_key), "pose_key")
-        reward = self._read(tensordict, next_key(self.reward_key), "reward_key")
-        done = self._read(tensordict, next_key(self.done_key), "done_key")
-        terminated = self._read(tensordict, next_key(self.terminated_key), "terminated_key")
-        truncated = self._read(tensordict, next_key(self.truncated_key), "truncated_key")
+        keys = self.keys
+        mask = self._read(tensordict, "goal", keys.goal_mask)
+        goal_pose = self._read(tensordict, "goal", keys.goal_pose)
+        next_pose = self._read_next(tensordict, "pose")
+        reward = self._read_next(tensordict, "reward")
+        done, terminated, truncated = (
+            self._read_next(tensordict, name) for name in ("done", "terminated", "truncated")
+        )
 
-        reached = (mask & self.tolerance(next_pose, goal_pose).unsqueeze(-1)).reshape(reward.shape)
-        tensordict.set(next_key(self.reward_key), torch.where(reached, reward + self.success_reward, reward))
-        tensordict.set(next_key(self.done_key), done | reached)
-        tensordict.set(next_key(self.terminated_key), terminated | reached)
-        tensordict.set(next_key(self.truncated_key), truncated & ~reached)
+        reached = (mask & self.poses.reached(next_pose, goal_pose).unsqueeze(-1)).reshape(reward.shape)
+        tensordict.set(keys.next("reward"), torch.where(reached, reward + self.success_reward, reward))
+        tensordict.set(keys.next("done"), done | reached)
+        tensordict.set(keys.next("terminated"), terminated | reached)
+        tensordict.set(keys.next("truncated"), truncated & ~reached)
         return tensordict

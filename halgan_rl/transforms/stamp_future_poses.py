@@ -3,11 +3,11 @@
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
-from torch import Tensor
+from tensordict import TensorDict, TensorDictBase
 
-from halgan_rl.poses import check_pose_size
-from halgan_rl.transforms.base import ReplayTransform, dotted, next_key
+from halgan_rl.keys import Keys, dotted
+from halgan_rl.poses import PlanarPoses, Poses, short
+from halgan_rl.transforms.base import ReplayTransform
 from halgan_rl.transforms.unfinished_episode import Steps, UnfinishedEpisode, concatenate, future_poses
 
 
@@ -35,11 +35,8 @@ class StampFuturePoses(ReplayTransform):
         max_distance: D, the furthest goal in steps (the paper's longest failed snippet: 32 for Navigate).
 
     Keyword Args:
-        pose_key: Pose ``[P]``, P >= 3, x [m], y [m], yaw [rad], flags. Read at the root and under ``"next"``.
-        reward_key: Reward ``[1]``, read under ``"next"``.
-        done_key: End-of-episode flag ``[1]``, read under ``"next"``.
-        terminated_key: Termination flag ``[1]``, read under ``"next"``.
-        hindsight_key: Where ``"pose"`` ``[D, P]`` and ``"horizon"`` ``[1]`` int64 are written.
+        poses: What the entries of a pose mean.
+        keys: Where rows keep what.
 
     Raises:
         ValueError: If ``max_distance`` is less than 1; on writing, if a pose is not finite or of the wrong size, or if
@@ -63,21 +60,14 @@ class StampFuturePoses(ReplayTransform):
         self,
         max_distance: int = 32,
         *,
-        pose_key: NestedKey = "pose",
-        reward_key: NestedKey = "reward",
-        done_key: NestedKey = "done",
-        terminated_key: NestedKey = "terminated",
-        hindsight_key: NestedKey = "hindsight",
+        poses: Poses = PlanarPoses(),  # noqa: B008 (frozen)
+        keys: Keys = Keys(),  # noqa: B008 (frozen)
     ) -> None:
-        super().__init__()
+        super().__init__(keys)
         if max_distance < 1:
             raise ValueError(f"max_distance must be at least 1 step, got {max_distance}.")
         self.max_distance = max_distance
-        self.pose_key = pose_key
-        self.reward_key = reward_key
-        self.done_key = done_key
-        self.terminated_key = terminated_key
-        self.hindsight_key = hindsight_key
+        self.poses = poses
         self._waiting: list[UnfinishedEpisode] = []  # one an environment
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -94,7 +84,6 @@ class StampFuturePoses(ReplayTransform):
         rows = self._by_environment(tensordict)
         steps = self._read_steps(rows)
         waiting = self._waiting or [UnfinishedEpisode() for _ in range(len(rows))]
-        self._check_poses(steps, waiting)
         self._check_continuity(steps, waiting)
         self._waiting = waiting
         ready = [self._stamp(waiting[e], rows[e], Steps(*(entry[e] for entry in steps))) for e in range(len(rows))]
@@ -131,10 +120,7 @@ class StampFuturePoses(ReplayTransform):
 
     def _is_stamped(self, tensordict: TensorDictBase) -> bool:
         keys = tensordict.keys(True, True)
-        return self._hindsight("pose") in keys and self._hindsight("horizon") in keys
-
-    def _hindsight(self, name: str) -> NestedKey:
-        return unravel_key((self.hindsight_key, name))
+        return self.keys.hindsight_pose in keys and self.keys.hindsight_horizon in keys
 
     def _by_environment(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns the rows as ``[E, T]``."""
@@ -153,29 +139,14 @@ class StampFuturePoses(ReplayTransform):
 
     def _read_steps(self, rows: TensorDictBase) -> Steps:
         """Reads what hindsight needs to know of each row, ``[..., T]``."""
-        done = self._read(rows, next_key(self.done_key), "done_key").reshape(rows.shape)
-        terminated = self._read(rows, next_key(self.terminated_key), "terminated_key").reshape(rows.shape)
-        reward = self._read(rows, next_key(self.reward_key), "reward_key").reshape(rows.shape)
-        pose = self._read(rows, self.pose_key, "pose_key")
-        next_pose = self._read(rows, next_key(self.pose_key), "pose_key")
-        check_pose_size(pose, f"{type(self).__name__}: the entry {dotted(self.pose_key)}")
-        check_pose_size(next_pose, f"{type(self).__name__}: the entry {dotted(next_key(self.pose_key))}")
-        turned = (pose[..., 3:] != next_pose[..., 3:]).any(-1)
+        done = self._read_next(rows, "done").reshape(rows.shape)
+        terminated = self._read_next(rows, "terminated").reshape(rows.shape)
+        reward = self._read_next(rows, "reward").reshape(rows.shape)
+        pose, next_pose = self._read(rows, "pose"), self._read_next(rows, "pose")
+        self.poses.check(pose, f"{type(self).__name__}: the entry {dotted(self.keys.pose)}")
+        self.poses.check(next_pose, f"{type(self).__name__}: the entry {dotted(self.keys.next('pose'))}")
+        turned = self.poses.stage_changed(pose, next_pose)
         return Steps(pose, next_pose, last=done | terminated, solved=terminated | (reward > 0), turned=turned)
-
-    def _check_poses(self, steps: Steps, waiting: list[UnfinishedEpisode]) -> None:
-        """Refuses poses of another size than the pose they follow, and poses that are not finite."""
-        size = next((held.steps.pose.shape[-1] for held in waiting if held.count), steps.pose.shape[-1])
-        for pose, key in ((steps.pose, self.pose_key), (steps.next_pose, next_key(self.pose_key))):
-            if pose.shape[-1] != size:
-                raise ValueError(f"The entry {dotted(key)} has {pose.shape[-1]} numbers, the pose before it {size}.")
-            bad = ~torch.isfinite(pose).all(-1)
-            if bad.any():
-                environment, time = bad.nonzero()[0].tolist()
-                raise ValueError(
-                    f"The entry {dotted(key)} is not finite: {_short(pose[environment, time])} in row {time} of "
-                    f"environment {environment}. No row of this batch was written. Mend the pose observation."
-                )
 
     def _check_continuity(self, steps: Steps, waiting: list[UnfinishedEpisode]) -> None:
         """Refuses rows that start elsewhere than where the row before them, in the same episode, ended.
@@ -190,7 +161,7 @@ class StampFuturePoses(ReplayTransform):
         if found:
             environment, time = found[0]
             raise ValueError(
-                f"Row {time} of environment {environment} starts at {_short(steps.pose[environment, time])}, not "
+                f"Row {time} of environment {environment} starts at {short(steps.pose[environment, time])}, not "
                 "where the row before it ended, though that one did not end an episode. Rows must be consecutive "
                 "steps, [T] or [E, T]: stack several workers' rows rather than joining them (cat_results='stack'), and "
                 "before a reset in mid-episode write the rows held back: replay_buffer.extend(transform.flush())."
@@ -211,12 +182,7 @@ class StampFuturePoses(ReplayTransform):
         released, start = [], 0
         for chunk in waiting.pop(count):
             span = slice(start, start := start + len(chunk))
-            chunk.set(self._hindsight("pose"), poses[span])
-            chunk.set(self._hindsight("horizon"), horizons[span])
+            chunk.set(self.keys.hindsight_pose, poses[span])
+            chunk.set(self.keys.hindsight_horizon, horizons[span])
             released.append(chunk)
         return released
-
-
-def _short(pose: Tensor) -> list[float]:
-    """A pose for people."""
-    return [round(number, 4) for number in pose.tolist()]

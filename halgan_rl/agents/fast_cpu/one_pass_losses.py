@@ -20,7 +20,7 @@ from torchrl.objectives.utils import distance_loss
 
 from halgan_rl.agents.networks import Actor, Critic, QNetwork, deterministic_policy, greedy_policy, see
 from halgan_rl.agents.objectives import UnsaturatedDDPGLoss
-from halgan_rl.transforms.base import next_key
+from halgan_rl.keys import next_key
 
 
 class _OnePassLoss(LossModule):
