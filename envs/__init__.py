@@ -9,16 +9,14 @@ torch.Size([64, 64, 3])
 Importing it registers the Gymnasium ids of all named environments, e.g. ``halgan_rl/Navigate2m-v0``.
 """
 
-from typing import Any
-
 from . import rendering  # First: it settles the OpenGL backend, which mujoco and dm_control read once.
 from .adapters.gymnasium_env import GymnasiumEnv, gymnasium_id, register_named
-from .adapters.torchrl_env import ComposerEnv
+from .adapters.torchrl_env import ComposerEnv, make
+from .domains import domain
 from .environment import Environment
 from .near_goal import collect_failed, collect_near_goal
 from .oracle import GoalRenderer
-from .rendering.fingerprint import fingerprint
-from .suite.names import NAMES, goal_offsets, named, pose_flags
+from .suite.names import NAMES, named
 from .suite.navigate import navigate_2m, navigate_4m
 from .suite.pebble import find_pebble
 from .suite.pick_and_place import pick_and_place_2m
@@ -31,6 +29,7 @@ __all__ = [
     "GymnasiumEnv",
     "collect_failed",
     "collect_near_goal",
+    "domain",
     "find_pebble",
     "fingerprint",
     "goal_offsets",
@@ -47,15 +46,16 @@ __all__ = [
 register_named()
 
 
-def make(name: str, *, seed: int | None = None, **kwargs: Any) -> ComposerEnv:
-    """Makes a named environment with its TorchRL face.
+def fingerprint(name: str) -> dict[str, str]:
+    """Returns what the images of a named environment depend on, see :class:`halgan_rl.experiment.domain.Domain`."""
+    return dict(domain(name).fingerprint)
 
-    Args:
-        name: One of ``NAMES``.
-        seed: Of the starts; equal seeds give equal episodes.
-        kwargs: Further arguments of the environment's function, e.g. ``time_limit`` [s].
 
-    Raises:
-        ValueError: if the name is unknown.
-    """
-    return ComposerEnv(named(name)(random_state=seed, **kwargs))
+def goal_offsets(name: str) -> tuple[float, ...]:
+    """Returns how far ahead of a goal pose the goal stands [m], for each setting of the flags."""
+    return domain(name).poses.goal_offsets
+
+
+def pose_flags(name: str) -> tuple[str, ...]:
+    """Returns the names of the entries of a pose after x, y and yaw."""
+    return domain(name).poses.flags

@@ -28,9 +28,14 @@ class GoalRenderer:
     """
 
     def __init__(self, environment: str | Environment) -> None:
-        self._environment = _build(environment)
-        self._environment.reset()  # Compiles the model for good.
-        self._task, self._physics = self._environment.task, self._environment.physics
+        self.environment = environment if isinstance(environment, Environment) else named(environment)(random_state=0)
+        self.environment.reset()  # Compiles the model for good.
+        self._task, self._physics = self.environment.task, self.environment.physics
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """Names of the entries of a pose after x, y and yaw."""
+        return self._task.flags
 
     def __call__(self, pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
         """Renders the goal into every image.
@@ -97,14 +102,10 @@ class GoalRenderer:
 
     def close(self) -> None:
         """Frees camera and physics."""
-        self._environment.close()
+        self.environment.close()
 
 
 def _check_size(size: int, flags: Sequence[str] = ()) -> None:
     entries = ("x", "y", "yaw", *flags)
     if size < len(entries):
         raise ValueError(f"Poses start with {', '.join(entries)}; this one has size {size}.")
-
-
-def _build(environment: str | Environment) -> Environment:
-    return environment if isinstance(environment, Environment) else named(environment)(random_state=0)

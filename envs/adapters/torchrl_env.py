@@ -1,4 +1,4 @@
-"""ComposerEnv: the TorchRL face of an environment."""
+"""ComposerEnv: the TorchRL adapter of an environment."""
 
 from typing import Any
 
@@ -10,6 +10,7 @@ from torchrl.data import Binary, Bounded, Composite, OneHot, Unbounded
 from torchrl.envs import EnvBase
 
 from ..environment import Environment
+from ..suite.names import named
 from .transition import Transition, advance, read
 
 
@@ -19,8 +20,8 @@ class ComposerEnv(EnvBase):
     Reads ``action``, float32 [2], or one-hot int64 [A] where actions are discrete; writes ``pixels`` uint8 [64, 64, 3],
     ``pose`` float32 [P] (x [m], y [m], yaw [rad], then the flags of the task), ``reward`` float32 [1], and ``done``,
     ``terminated``, ``truncated`` bool [1]. Success terminates; the time limit truncates. Pickle a factory such as
-    ``functools.partial(halgan_envs.make, "navigate-2m")``, not the environment: an OpenGL context lives in one process and,
-    with EGL, on one thread.
+    ``functools.partial(halgan_envs.make, "navigate-2m")``, not the environment: an OpenGL context lives in one process
+    and, with EGL, on one thread.
 
     Args:
         environment: The environment, owned and closed by this one.
@@ -38,7 +39,7 @@ class ComposerEnv(EnvBase):
             pixels=Bounded(0, 255, shape=(height, width, 3), dtype=torch.uint8),
             pose=Unbounded(shape=self.environment.task.pose_spec.shape, dtype=torch.float32),
         )
-        self.action_spec = _action_spec(self.environment.action_spec())
+        self.action_spec = action_spec(self.environment)
         self._is_one_hot = isinstance(self.action_spec, OneHot)
         self.reward_spec = Unbounded(shape=(1,), dtype=torch.float32)
         self.done_spec = Composite(
@@ -85,7 +86,23 @@ class ComposerEnv(EnvBase):
         self.environment.close()
 
 
-def _action_spec(spec: specs.Array) -> Bounded | OneHot:
+def make(name: str, *, seed: int | None = None, **kwargs: Any) -> ComposerEnv:
+    """Makes a named environment as a TorchRL environment.
+
+    Args:
+        name: One of ``halgan_envs.NAMES``.
+        seed: Of the starts; equal seeds give equal episodes.
+        kwargs: Further arguments of the environment's function, e.g. ``time_limit`` [s].
+
+    Raises:
+        ValueError: if the name is unknown.
+    """
+    return ComposerEnv(named(name)(random_state=seed, **kwargs))
+
+
+def action_spec(environment: Environment) -> Bounded | OneHot:
+    """Returns the spec of an environment's actions: float32 [2] in [-1, 1], or one-hot int64 [A] if discrete."""
+    spec = environment.action_spec()
     if isinstance(spec, specs.DiscreteArray):
         return OneHot(spec.num_values, dtype=torch.int64)
     return Bounded(-1.0, 1.0, shape=spec.shape, dtype=torch.float32)

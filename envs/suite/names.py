@@ -1,7 +1,6 @@
 """The named environments."""
 
 from collections.abc import Callable
-from contextlib import closing
 
 from ..environment import Environment
 from .navigate import navigate_2m, navigate_4m
@@ -17,34 +16,8 @@ NAMES: dict[str, Callable[..., Environment]] = {
 """Functions that take ``random_state`` and ``time_limit`` [s] and build an environment."""
 
 
-def goal_offsets(name: str) -> tuple[float, ...]:
-    """How far ahead of a goal pose the goal stands, on average [m]: for each setting of the pose's flags.
-
-    >>> goal_offsets("navigate-2m")
-    (0.14,)
-
-    Raises:
-        ValueError: if the name is unknown.
-    """
-    with closing(named(name)()) as environment:
-        return environment.task.goal_offsets
-
-
-def pose_flags(name: str) -> tuple[str, ...]:
-    """The names of the entries of a pose after x, y and yaw, each 0 or 1.
-
-    >>> pose_flags("pick-and-place-2m")
-    ('held',)
-
-    Raises:
-        ValueError: if the name is unknown.
-    """
-    with closing(named(name)()) as environment:
-        return environment.task.flags
-
-
 def named(name: str) -> Callable[..., Environment]:
-    """The function that builds a named environment.
+    """Returns the function that builds a named environment.
 
     Raises:
         ValueError: if the name is unknown.

@@ -85,7 +85,7 @@ def test_a_pose_without_yaw_is_refused(renderer):
 
 def test_rendering_after_close_says_so():
     renderer = halgan_envs.GoalRenderer("navigate-2m")
-    camera = renderer._environment.task.robot.camera
+    camera = renderer.environment.task.robot.camera
     renderer.close()
     renderer.close()
     with pytest.raises(RuntimeError, match="closed"):

@@ -17,20 +17,22 @@ def run_python(code, **variables):
 @pytest.mark.parametrize("closing", ["", "env.close(); camera.close()"])
 def test_a_process_ends_quietly(closing):
     done = run_python(
-        "import envs; env = halgan_envs.make('navigate-2m', seed=0); env.rollout(3); env.render_overview();"
+        "import halgan_envs; env = halgan_envs.make('navigate-2m', seed=0); env.rollout(3); env.render_overview();"
         f"camera = env.robot.camera; other = halgan_envs.GoalRenderer('navigate-2m'); {closing}"
     )
     assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_an_unknown_backend_is_refused_before_any_work():
-    done = run_python("import envs", MUJOCO_GL="vulkan")
+    done = run_python("import halgan_envs", MUJOCO_GL="vulkan")
     assert done.returncode != 0
     assert "MUJOCO_GL='vulkan' cannot render images: unset it" in done.stderr.splitlines()[-1]
 
 
 def test_a_backend_that_is_not_installed_says_what_to_install():
-    done = run_python("import envs; halgan_envs.make('navigate-2m')", MUJOCO_GL="osmesa", PYOPENGL_PLATFORM="osmesa")
+    done = run_python(
+        "import halgan_envs; halgan_envs.make('navigate-2m')", MUJOCO_GL="osmesa", PYOPENGL_PLATFORM="osmesa"
+    )
     if done.returncode == 0:
         pytest.skip("OSMesa is installed here.")
     assert "apt-get install" in done.stderr.splitlines()[-1]
