@@ -41,10 +41,10 @@ class PlanarPoses:
         ValueError: if a tolerance is not positive, an offset negative, or there are offsets for other settings.
 
     Examples:
-        >>> poses = PlanarPoses(flags=("held",), goal_offsets=(0.1, 0.2))
+        >>> poses = PlanarPoses(flags=("held",), goal_offsets=(0.25, 0.5))
         >>> here, there = torch.tensor([0.0, 0.0, 0.0, 1.0]), torch.tensor([1.0, 1.0, math.pi / 2, 0.0])
-        >>> poses.goal_position(here, there).round(decimals=3).tolist()  # 0.2 m ahead, for the robot holds the box
-        [1.0, 1.2]
+        >>> poses.goal_position(here, there).round(decimals=3).tolist()  # 0.5 m ahead, for the robot holds the box
+        [1.0, 1.5]
     """
 
     flags: tuple[str, ...] = ()

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from halgan_rl.poses import PoseTolerance, relative_pose, wrap_angle
+from halgan_rl.poses import PlanarPoses, relative_pose, wrap_angle
 
 VIEW = 7  # cells seen to each side
 SIZE = 2 * VIEW + 1
@@ -51,7 +51,7 @@ class Parking(EnvBase):
         shape = self.batch_size
         self.time_limit = time_limit
         self.distance = distance
-        self.is_parked = PoseTolerance()
+        self.poses = PlanarPoses()
         self.observation_spec = Composite(
             pixels=Unbounded((*shape, SIZE, SIZE, 3), dtype=torch.uint8), pose=Unbounded((*shape, 3)), shape=shape
         )
@@ -64,7 +64,7 @@ class Parking(EnvBase):
         self.set_seed(seed)
 
     def _set_seed(self, seed: int | None) -> None:
-        self.random = torch.Generator().manual_seed(seed or 0)
+        self.rng = torch.Generator().manual_seed(seed or 0)
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
         chosen = torch.ones(self.batch_size, dtype=torch.bool)
@@ -83,7 +83,7 @@ class Parking(EnvBase):
         moved = [x + (ahead * yaw.cos()).round(), y + (ahead * yaw.sin()).round(), wrap_angle(yaw + turn * math.pi / 2)]
         self.pose = torch.stack(moved, dim=-1)
         self.time = self.time + 1
-        terminated = self.is_parked(self.pose, self.goal_pose)[..., None]
+        terminated = self.poses.reached(self.pose, self.goal_pose)[..., None]
         truncated = (self.time >= self.time_limit)[..., None] & ~terminated
         flags = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
         return TensorDict({**self._observe(), "reward": terminated.float(), **flags}, batch_size=self.batch_size)
@@ -95,7 +95,7 @@ class Parking(EnvBase):
         """Draws cells whose larger coordinate lies between two distances, and headings."""
 
         def draw(low: int, high: int) -> Tensor:
-            return torch.randint(low, high + 1, self.batch_size, generator=self.random).float()
+            return torch.randint(low, high + 1, self.batch_size, generator=self.rng).float()
 
         far, near = draw(nearest, furthest) * (2 * draw(0, 1) - 1), draw(-furthest, furthest)
         swap = draw(0, 1).bool()

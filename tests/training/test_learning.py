@@ -10,6 +10,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import EGreedyModule, QValueActor
 from torchrl.objectives import DQNLoss, SoftUpdate
 
+from halgan_rl.transforms.annealing import Annealing
 from halgan_rl.transforms.pipelines import halgan
 from tests import toy
 from tests.transforms.rows import random_source
@@ -45,11 +46,9 @@ def train(probability: float, seed: int = 1, frames: int = FRAMES) -> tuple[floa
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
     pipeline = halgan(
         toy.hallucinate,
-        generator=random_source(seed),
+        rng=random_source(seed),
         max_distance=16,
-        probability=probability,
-        final_probability=probability / 2,
-        annealing_steps=frames,
+        probability=Annealing(probability, probability / 2, frames),
     )
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(frames), transform=pipeline, batch_size=64, generator=random_source(seed)
@@ -61,7 +60,7 @@ def train(probability: float, seed: int = 1, frames: int = FRAMES) -> tuple[floa
     for batch in collector:
         buffer.extend(batch)
         explore.step(batch.numel())
-        pipeline[1].step(batch.numel())
+        pipeline.step(batch.numel())
         successes += int(batch["next", "terminated"].sum())
         for _ in range(4 if len(buffer) > 500 else 0):
             optimizer.zero_grad()

@@ -7,6 +7,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
+from halgan_rl.keys import Keys
 from halgan_rl.transforms import (
     DrawHindsightGoal,
     HallucinateGoal,
@@ -14,6 +15,7 @@ from halgan_rl.transforms import (
     ReplayTransform,
     StampFuturePoses,
 )
+from halgan_rl.transforms.annealing import Annealing
 
 DISTANCE = 4
 RENAMED: dict[str, NestedKey] = {
@@ -26,6 +28,7 @@ RENAMED: dict[str, NestedKey] = {
     "hindsight": ("extras", "hindsight"),
     "goal": ("extras", "goal"),
 }
+NESTED = Keys(**RENAMED)
 
 
 def invert(pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
@@ -132,14 +135,19 @@ def random_source(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
+def always(probability: float) -> Annealing:
+    """A probability that stays."""
+    return Annealing(probability, probability, 1)
+
+
 @dataclass(frozen=True)
 class Case:
     """A transform and what the common tests must know of it."""
 
     make: Callable[..., ReplayTransform]
-    """Builds it; takes key arguments."""
+    """Builds it; takes ``keys``."""
     reads: dict[str, tuple[NestedKey, ...]]
-    """Which entries each key argument makes it read."""
+    """Which entries each field of the keys makes it read."""
     writes: tuple[NestedKey, ...] = ()
     """Which entries it sets on the sample path."""
     on_write: bool = False
@@ -153,54 +161,54 @@ CASES = {
     "StampFuturePoses": Case(
         lambda **keys: StampFuturePoses(DISTANCE, **keys),
         {
-            "pose_key": ("pose", ("next", "pose")),
-            "reward_key": (("next", "reward"),),
-            "done_key": (("next", "done"),),
-            "terminated_key": (("next", "terminated"),),
+            "pose": ("pose", ("next", "pose")),
+            "reward": (("next", "reward"),),
+            "done": (("next", "done"),),
+            "terminated": (("next", "terminated"),),
         },
         on_write=True,
     ),
     "DrawHindsightGoal": Case(
-        lambda **keys: DrawHindsightGoal(0.5, generator=random_source(), **keys),
-        {"pose_key": ("pose",), "hindsight_key": (("hindsight", "pose"), ("hindsight", "horizon"))},
+        lambda **keys: DrawHindsightGoal(always(0.5), rng=random_source(), **keys),
+        {"pose": ("pose",), "hindsight": (("hindsight", "pose"), ("hindsight", "horizon"))},
         (("goal", "mask"), ("goal", "pose")),
     ),
     "HallucinateGoal": Case(
         lambda **keys: HallucinateGoal(invert, **keys),
         {
-            "pixels_key": ("pixels", ("next", "pixels")),
-            "pose_key": ("pose", ("next", "pose")),
-            "goal_key": (("goal", "mask"), ("goal", "pose")),
+            "pixels": ("pixels", ("next", "pixels")),
+            "pose": ("pose", ("next", "pose")),
+            "goal": (("goal", "mask"), ("goal", "pose")),
         },
         ("pixels", ("next", "pixels")),
     ),
     "HallucinateGoal(seen)": Case(
         lambda **keys: HallucinateGoal(invert_most, pursue_unseen=False, **keys),
         {
-            "pixels_key": ("pixels", ("next", "pixels")),
-            "pose_key": ("pose", ("next", "pose")),
-            "goal_key": (("goal", "mask"), ("goal", "pose")),
+            "pixels": ("pixels", ("next", "pixels")),
+            "pose": ("pose", ("next", "pose")),
+            "goal": (("goal", "mask"), ("goal", "pose")),
         },
         ("pixels", ("next", "pixels"), ("goal", "mask")),
     ),
     "HallucinateGoal(fixed_shape)": Case(
         lambda **keys: HallucinateGoal(invert_most, fixed_shape=True, pursue_unseen=False, **keys),
         {
-            "pixels_key": ("pixels", ("next", "pixels")),
-            "pose_key": ("pose", ("next", "pose")),
-            "goal_key": (("goal", "mask"), ("goal", "pose")),
+            "pixels": ("pixels", ("next", "pixels")),
+            "pose": ("pose", ("next", "pose")),
+            "goal": (("goal", "mask"), ("goal", "pose")),
         },
         ("pixels", ("next", "pixels"), ("goal", "mask")),
     ),
     "HindsightReward": Case(
         lambda **keys: HindsightReward(**keys),
         {
-            "pose_key": (("next", "pose"),),
-            "goal_key": (("goal", "mask"), ("goal", "pose")),
-            "reward_key": (("next", "reward"),),
-            "done_key": (("next", "done"),),
-            "terminated_key": (("next", "terminated"),),
-            "truncated_key": (("next", "truncated"),),
+            "pose": (("next", "pose"),),
+            "goal": (("goal", "mask"), ("goal", "pose")),
+            "reward": (("next", "reward"),),
+            "done": (("next", "done"),),
+            "terminated": (("next", "terminated"),),
+            "truncated": (("next", "truncated"),),
         },
         (("next", "reward"), ("next", "done"), ("next", "terminated"), ("next", "truncated")),
     ),

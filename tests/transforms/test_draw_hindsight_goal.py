@@ -1,11 +1,13 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 
 from halgan_rl.transforms import DrawHindsightGoal
-from tests.transforms.rows import assert_identical, random_source
+from halgan_rl.transforms.annealing import Annealing
+from tests.transforms.rows import always, assert_identical, random_source
 
 STEPS = 8
 
@@ -20,8 +22,9 @@ def rows(count: int, horizon: int | list[int] = STEPS) -> TensorDict:
     )
 
 
-def draw(probability: float = 1.0, *, seed: int = 0, **options: object) -> DrawHindsightGoal:
-    return DrawHindsightGoal(probability, generator=random_source(seed), **options)
+def draw(probability: float | Annealing = 1.0, *, seed: int = 0, **options: object) -> DrawHindsightGoal:
+    annealing = probability if isinstance(probability, Annealing) else always(probability)
+    return DrawHindsightGoal(annealing, rng=random_source(seed), **options)
 
 
 def offsets(out: TensorDictBase) -> torch.Tensor:
@@ -51,13 +54,13 @@ def test_rows_are_relabelled_at_the_given_rate(probability: float) -> None:
 @pytest.mark.parametrize("horizon", [1, 2, 5, STEPS])
 def test_the_offset_is_uniform_on_one_to_the_horizon(horizon: int) -> None:
     count = torch.bincount(offsets(draw()(rows(20_000, horizon))), minlength=STEPS + 1)
-    share = 1 / horizon
-    expected = torch.tensor([share if 1 <= d <= horizon else 0.0 for d in range(STEPS + 1)]) * 20_000
-    assert (count - expected).abs().max() <= 4 * math.sqrt(20_000 * share * (1 - share))
+    fraction = 1 / horizon
+    expected = torch.tensor([fraction if 1 <= d <= horizon else 0.0 for d in range(STEPS + 1)]) * 20_000
+    assert (count - expected).abs().max() <= 4 * math.sqrt(20_000 * fraction * (1 - fraction))
 
 
 @pytest.mark.parametrize("nearness", [1.5, 2.0, 4.0])
-def test_nearness_raises_the_share_of_near_goals(nearness: float) -> None:
+def test_nearness_raises_the_fraction_of_near_goals(nearness: float) -> None:
     count = torch.bincount(offsets(draw(nearness=nearness)(rows(20_000))), minlength=STEPS + 1)[1:]
     edges = (torch.arange(STEPS + 1) / STEPS) ** (1 / nearness)
     expected = 20_000 * edges.diff()
@@ -83,14 +86,14 @@ def test_a_row_at_its_goal_is_not_relabelled() -> None:
     assert draw()(standing)["goal", "mask"].flatten().tolist() == [True, False, True, True]
 
 
-def test_without_tolerance_a_row_at_its_goal_is_relabelled() -> None:
+def test_a_row_at_its_goal_is_relabelled_on_request() -> None:
     standing = rows(4)
     standing["hindsight", "pose"].zero_()
-    assert draw(tolerance=None)(standing)["goal", "mask"].all()
+    assert draw(skip_reached=False)(standing)["goal", "mask"].all()
 
 
 def test_goals_are_later_poses_and_never_the_rows_own() -> None:
-    assert offsets(draw(tolerance=None)(rows(1_000))).min() == 1
+    assert offsets(draw(skip_reached=False)(rows(1_000))).min() == 1
 
 
 def test_the_mask_and_pose_have_the_shapes_of_the_contract() -> None:
@@ -106,33 +109,33 @@ def test_the_same_seed_draws_the_same_goals() -> None:
 
 
 def test_the_probability_is_annealed_linearly_and_then_stays() -> None:
-    transform = draw(0.3, final_probability=0.1, annealing_steps=100)
-    seen = [transform.probability.item()]
+    transform = draw(Annealing(0.3, 0.1, 100))
+    seen = [transform.probability]
     for frames in (25, 25, 50, 1_000):
         transform.step(frames)
-        seen.append(transform.probability.item())
+        seen.append(transform.probability)
     assert seen == pytest.approx([0.3, 0.25, 0.2, 0.1, 0.1])
 
 
 def test_one_call_of_many_frames_anneals_like_many_calls_of_one() -> None:
-    many, one = draw(0.3, annealing_steps=7), draw(0.3, annealing_steps=7)
+    many, one = draw(Annealing(0.3, 0.0, 7)), draw(Annealing(0.3, 0.0, 7))
     for _ in range(5):
         many.step()
     one.step(5)
-    assert torch.equal(many.probability, one.probability)
+    assert many.probability == one.probability
 
 
 def test_the_annealed_probability_is_the_one_used() -> None:
-    transform = draw(1.0, final_probability=0.0, annealing_steps=10)
+    transform = draw(Annealing(1.0, 0.0, 10))
     transform.step(10)
     assert not transform(rows(1_000))["goal", "mask"].any()
 
 
-def test_the_schedule_and_the_generator_round_trip_through_the_state_dict() -> None:
-    transform = draw(0.9, annealing_steps=10, seed=1)
+def test_the_frames_and_the_rng_round_trip_through_the_state_dict() -> None:
+    transform = draw(Annealing(0.9, 0.0, 10), seed=1)
     transform.step(3)
     transform(rows(5))
-    other = draw(0.9, annealing_steps=10, seed=2)
+    other = draw(Annealing(0.9, 0.0, 10), seed=2)
     other.load_state_dict(transform.state_dict())
     assert_identical(other(rows(64)), transform(rows(64)))
     for each in (transform, other):
@@ -141,18 +144,13 @@ def test_the_schedule_and_the_generator_round_trip_through_the_state_dict() -> N
     assert other.probability == pytest.approx(0.9 * 0.3)
 
 
-def test_the_generator_must_be_given() -> None:
-    with pytest.raises(TypeError, match="generator"):
-        DrawHindsightGoal(0.3)  # type: ignore[call-arg]
+def test_the_rng_must_be_given() -> None:
+    with pytest.raises(TypeError, match="rng"):
+        DrawHindsightGoal()  # type: ignore[call-arg]
 
 
 @pytest.mark.parametrize("value", [-0.1, 1.5, math.nan])
-@pytest.mark.parametrize("name", ["probability", "final_probability"])
-def test_a_share_outside_zero_to_one_is_refused(name: str, value: float) -> None:
-    with pytest.raises(ValueError, match=rf"^{name} must lie in \[0, 1\], got {value}"):
-        DrawHindsightGoal(generator=random_source(), **{name: value})
-
-
-def test_annealing_over_no_frames_is_refused() -> None:
-    with pytest.raises(ValueError, match="annealing_steps must be at least 1 frame, got 0"):
-        draw(annealing_steps=0)
+@pytest.mark.parametrize("name", ["start", "end"])
+def test_a_probability_outside_zero_to_one_is_refused(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=rf"^probability\.{name} must lie in \[0, 1\], got {value}"):
+        draw(replace(Annealing(0.3, 0.1, 10), **{name: value}))

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from halgan_rl.poses import PoseTolerance
+from halgan_rl.poses import PlanarPoses
 from halgan_rl.transforms import HindsightReward
 from tests.transforms.rows import assert_identical, sampled_rows
 
@@ -41,7 +41,7 @@ def test_the_tolerance_decides_what_is_near_enough() -> None:
     rows = sampled_rows(6)
     rows["goal", "pose"][THERE, 0] += 0.05
     assert not HindsightReward()(rows)["next", "terminated"][THERE].item()
-    assert HindsightReward(tolerance=PoseTolerance(distance=0.06))(rows)["next", "terminated"][THERE].item()
+    assert HindsightReward(poses=PlanarPoses(distance=0.06))(rows)["next", "terminated"][THERE].item()
 
 
 def test_rewards_and_flags_without_a_trailing_dimension_are_not_broadcast() -> None:

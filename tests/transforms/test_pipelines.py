@@ -11,10 +11,28 @@ from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorDictReplayB
 from torchrl.data.replay_buffers import SamplerWithoutReplacement, SliceSampler
 from torchrl.envs import Compose, SerialEnv
 
-from halgan_rl.poses import PoseTolerance, relative_pose
-from halgan_rl.transforms import DrawHindsightGoal, HallucinateGoal, HindsightReward, StampFuturePoses, pipelines
+from halgan_rl.keys import Keys
+from halgan_rl.poses import PlanarPoses, relative_pose
+from halgan_rl.transforms import (
+    DrawHindsightGoal,
+    HallucinateGoal,
+    HindsightReward,
+    ReplayTransform,
+    StampFuturePoses,
+    pipelines,
+)
+from halgan_rl.transforms.annealing import Annealing
 from tests import toy
-from tests.transforms.rows import RENAMED, assert_identical, invert, leaves, random_source, rename, stamped_by_reference
+from tests.transforms.rows import (
+    NESTED,
+    always,
+    assert_identical,
+    invert,
+    leaves,
+    random_source,
+    rename,
+    stamped_by_reference,
+)
 
 DISTANCE = 6
 NAMED = {"halgan": pipelines.halgan, "oracle": pipelines.oracle}
@@ -37,10 +55,11 @@ def buffer_with(transform: Compose | StampFuturePoses, **options: object) -> Ten
     return TensorDictReplayBuffer(transform=transform, generator=random_source(7), **options)
 
 
-def make(pipeline: Callable = pipelines.halgan, probability: float = 1.0, **options: object) -> Compose:
-    return pipeline(
-        toy.hallucinate, generator=random_source(), probability=probability, max_distance=DISTANCE, **options
-    )
+def make(
+    pipeline: Callable = pipelines.halgan, probability: float | Annealing = 1.0, **options: object
+) -> pipelines.Hindsight:
+    annealing = probability if isinstance(probability, Annealing) else always(probability)
+    return pipeline(toy.hallucinate, rng=random_source(), probability=annealing, max_distance=DISTANCE, **options)
 
 
 def filled(transform: Compose, frames: int = 420, **options: object) -> TensorDictReplayBuffer:
@@ -96,9 +115,9 @@ def paint_what_is_ahead(pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tens
 @pytest.mark.parametrize("fixed_shape", [False, True])
 def test_unseen_goals_leave_no_trace_and_all_seen_ones_are_pursued(fixed_shape: bool) -> None:
     plain = filled(StampFuturePoses(DISTANCE)).sample(2_000)
-    options = {"max_distance": DISTANCE, "probability": 1.0, "fixed_shape": fixed_shape}
+    options = {"max_distance": DISTANCE, "probability": always(1.0), "fixed_shape": fixed_shape}
     drawn, relabelled = (
-        filled(pipelines.halgan(paint_what_is_ahead, generator=random_source(), pursue_unseen=unseen, **options))
+        filled(pipelines.halgan(paint_what_is_ahead, rng=random_source(), pursue_unseen=unseen, **options))
         for unseen in (True, False)
     )
     drawn, relabelled = drawn.sample(2_000)["goal"], relabelled.sample(2_000)
@@ -162,14 +181,13 @@ def test_a_sampler_without_replacement_gives_relabelled_rows() -> None:
 def test_slices_are_relabelled_row_by_row() -> None:
     sampler = SliceSampler(num_slices=8, end_key=("next", "done"), truncated_key=None)
     sample = filled(make(), sampler=sampler).sample()
-    reached = PoseTolerance()(sample["next", "pose"], sample["goal", "pose"])[:, None] & sample["goal", "mask"]
+    reached = PlanarPoses().reached(sample["next", "pose"], sample["goal", "pose"])[:, None] & sample["goal", "mask"]
     assert reached.any()
     assert sample["next", "terminated"][reached].all()
 
 
 def test_nested_keys_do_the_same() -> None:
-    keys = {f"{name}_key": key for name, key in RENAMED.items()}
-    flat, nested = buffer_with(make()), buffer_with(make(**keys))
+    flat, nested = buffer_with(make()), buffer_with(make(keys=NESTED))
     for batch in collect(210):
         flat.extend(batch)
         nested.extend(rename(batch))
@@ -191,47 +209,75 @@ def test_the_same_seeds_give_the_same_samples_whatever_the_global_seed() -> None
 
 
 def test_a_checkpoint_resumes_with_the_same_samples(tmp_path: Path) -> None:
-    buffer = filled(make(probability=0.9, annealing_steps=100))
-    buffer._transform[1].step(30)
+    annealing = Annealing(0.9, 0.0, 100)
+    buffer = filled(make(probability=annealing))
+    buffer._transform.step(30)
     buffer.sample()
     buffer.dumps(tmp_path)
-    restored = buffer_with(make(probability=0.9, annealing_steps=100))
+    restored = buffer_with(make(probability=annealing))
     restored.loads(tmp_path)
     assert_identical(restored.sample(), buffer.sample())
 
 
 def test_options_reach_the_parts() -> None:
-    tolerance = PoseTolerance(0.2, 0.3)
+    poses, annealing = PlanarPoses(distance=0.2, angle=0.3), Annealing(0.8, 0.1, 50)
     pipeline = make(
-        probability=0.8,
-        final_probability=0.1,
-        annealing_steps=50,
-        tolerance=tolerance,
+        probability=annealing,
+        nearness=2.0,
+        poses=poses,
+        keys=NESTED,
         success_reward=3.0,
         pursue_unseen=False,
         fixed_shape=True,
     )
     stamp, draw, paint, reward = pipeline
     assert stamp.max_distance == DISTANCE
-    assert (draw.probability.item(), draw.final_probability, draw.annealing_steps) == (pytest.approx(0.8), 0.1, 50)
-    assert (draw.tolerance, reward.tolerance, reward.success_reward) == (tolerance, tolerance, 3.0)
+    assert (draw.annealing, draw.nearness) == (annealing, 2.0)
+    assert stamp.poses is draw.poses is reward.poses is poses
+    assert all(part.keys is NESTED for part in pipeline)
+    assert reward.success_reward == 3.0
     assert not paint.pursue_unseen
     assert paint.fixed_shape
 
 
 def test_defaults_are_those_of_the_parts() -> None:
-    stamp, draw, paint, reward = pipelines.halgan(invert, generator=random_source())
-    alone = DrawHindsightGoal(generator=random_source())
-    for name in ("initial_probability", "final_probability", "annealing_steps", "tolerance"):
-        assert getattr(draw, name) == getattr(alone, name)
-    names = ("max_distance", "pursue_unseen", "fixed_shape", "success_reward", "tolerance")
-    for part, other in ((stamp, StampFuturePoses()), (paint, HallucinateGoal(invert)), (reward, HindsightReward())):
-        for name, value in vars(other).items():
-            if name.endswith("_key") or name in names:
-                assert getattr(part, name) == value
+    pipeline = pipelines.halgan(invert, rng=random_source())
+    alone = (
+        StampFuturePoses(),
+        DrawHindsightGoal(rng=random_source()),
+        HallucinateGoal(invert),
+        HindsightReward(),
+    )
+    for part, other in zip(pipeline, alone, strict=True):
+        assert settings(part) == settings(other)
+
+
+def settings(transform: ReplayTransform) -> dict[str, object]:
+    """The public attributes that the transform set itself."""
+    inherited = vars(ReplayTransform(Keys())).keys() - {"keys"}
+    return {
+        name: value for name, value in vars(transform).items() if name not in {*inherited, "rng"} and name[0] != "_"
+    }
+
+
+def test_a_pipeline_anneals_itself() -> None:
+    pipeline = make(probability=Annealing(0.4, 0.0, 100))
+    pipeline.step(25)
+    assert pipeline.probability == pytest.approx(0.3)
+
+
+def test_a_pipeline_says_which_rows_it_relabelled() -> None:
+    pipeline = make(probability=0.5, keys=NESTED)
+    buffer = buffer_with(pipeline)
+    for batch in collect(210):
+        buffer.extend(rename(batch))
+    sample = buffer.sample()
+    mask = pipeline.relabelled(sample)
+    assert torch.equal(mask, sample["extras", "goal", "mask"])
+    assert 0 < mask.sum() < 64
 
 
 @EVERY
 def test_an_unknown_option_is_named(pipeline: Callable) -> None:
     with pytest.raises(TypeError, match="'probabilty'"):
-        pipeline(invert, generator=random_source(), probabilty=0.3)
+        pipeline(invert, rng=random_source(), probabilty=0.3)
