@@ -32,7 +32,7 @@ class Keys:
     success: NestedKey | None = None
     """Success flag ``[1]``, under ``"next"``; None: a termination, or a reward above a threshold, is a success."""
     hindsight: NestedKey = "hindsight"
-    """Where each row's future is stored: ``"pose"`` ``[D, P]`` and ``"horizon"`` ``[1]`` int64."""
+    """Where each row's future is stored: ``"pose"`` ``[D, P]``, ``"horizon"`` ``[1]`` int64, ``"reward"`` ``[n]``."""
     goal: NestedKey = "goal"
     """Where a sampled row's goal is written: ``"mask"`` ``[1]`` bool and ``"pose"`` ``[P]``."""
 
@@ -49,6 +49,11 @@ class Keys:
     def hindsight_horizon(self) -> NestedKey:
         """How many of the future poses may serve as a goal, int64 ``[1]``."""
         return unravel_key((self.hindsight, "horizon"))
+
+    @property
+    def hindsight_reward(self) -> NestedKey:
+        """Rewards of the next n steps ``[n]``, of rows that span several steps."""
+        return unravel_key((self.hindsight, "reward"))
 
     @property
     def goal_mask(self) -> NestedKey:

@@ -20,6 +20,9 @@ class Poses(Protocol):
     def stage_changed(self, pose: Tensor, next_pose: Tensor) -> Tensor:
         """Returns bool ``[...]``: whether another goal is pursued at ``next_pose`` than at ``pose``."""
 
+    def travelled(self, pose: Tensor, next_pose: Tensor) -> Tensor:
+        """Returns ``[...]``: the distance [m] from ``pose`` to ``next_pose``; read only where a ``max_step`` is set."""
+
     def reached(self, pose: Tensor, goal_pose: Tensor) -> Tensor:
         """Returns bool ``[...]``: whether ``pose`` *is* the goal pose, within a tolerance. The two broadcast."""
 
@@ -110,9 +113,18 @@ class PlanarPoses:
         """
         return flag_number(pose)
 
+    def flags_of(self, setting: Tensor) -> Tensor:
+        """Returns the flags, float ``[..., P - 3]``, of numbered settings int64 ``[...]``: undoes :meth:`setting`."""
+        bits = 2 ** torch.arange(len(self.flags), device=setting.device)
+        return (setting.unsqueeze(-1) & bits).bool().float()
+
     def stage_changed(self, pose: Tensor, next_pose: Tensor) -> Tensor:
         """Returns bool ``[...]``: whether a flag differs, so that another goal is pursued."""
         return (self.flag_part(pose) != self.flag_part(next_pose)).any(-1)
+
+    def travelled(self, pose: Tensor, next_pose: Tensor) -> Tensor:
+        """Returns the distance in the plane from ``pose`` to ``next_pose`` ``[..., P]``: ``[...]`` [m]."""
+        return (next_pose[..., :2] - pose[..., :2]).norm(dim=-1)
 
     def reached(self, pose: Tensor, goal_pose: Tensor) -> Tensor:
         """Returns bool ``[...]``: whether ``pose`` is within both tolerances of ``goal_pose``; flags do not count."""

@@ -4,8 +4,11 @@ from collections import deque
 from typing import NamedTuple
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
+
+Layout = dict[NestedKey, tuple[torch.dtype, torch.Size]]
+"""Dtype and shape of each entry of a row."""
 
 
 class Steps(NamedTuple):
@@ -15,12 +18,14 @@ class Steps(NamedTuple):
     """``[..., T, P]`` pose at t."""
     next_pose: Tensor
     """``[..., T, P]`` pose at t+1."""
+    reward: Tensor
+    """``[..., T]`` reward of the row."""
     last: Tensor
     """``[..., T]`` bool: the row ends its episode."""
     solved: Tensor
-    """``[..., T]`` bool: the row earned a positive reward or terminated, so its next pose is no failure's."""
+    """``[..., T]`` bool: the row is a success, so its next pose is no failure's."""
     turned: Tensor
-    """``[..., T]`` bool: the pose's flags change in the row: the goal before it is reached, another one pursued."""
+    """``[..., T]`` bool: another goal is pursued after the row: the one before is reached."""
 
 
 def future_poses(steps: Steps, count: int, max_distance: int) -> tuple[Tensor, Tensor]:
@@ -36,7 +41,7 @@ def future_poses(steps: Steps, count: int, max_distance: int) -> tuple[Tensor, T
     """
     total = len(steps.last)
     time = torch.arange(total, device=steps.last.device)
-    end = _first_at_or_after(torch.where(steps.last, time, total - 1))[:count]
+    end = episode_end(steps)[:count]
     solved = _first_at_or_after(torch.where(steps.solved, time, total))[:count]
     turned = _first_at_or_after(torch.where(steps.turned, time, total))[:count]
     now = time[:count]
@@ -44,6 +49,12 @@ def future_poses(steps: Steps, count: int, max_distance: int) -> tuple[Tensor, T
     ahead = torch.arange(max_distance, device=now.device)
     poses = steps.next_pose[torch.minimum(now[:, None] + ahead, end[:, None])]
     return poses, horizon[:, None]
+
+
+def episode_end(steps: Steps) -> Tensor:
+    """Returns, for each of T rows, the place of the last one of its episode, int64 ``[T]``: T - 1 if it goes on."""
+    total = len(steps.last)
+    return _first_at_or_after(torch.where(steps.last, torch.arange(total, device=steps.last.device), total - 1))
 
 
 def _first_at_or_after(time: Tensor) -> Tensor:
@@ -60,22 +71,31 @@ class UnfinishedEpisode:
     def __init__(self) -> None:
         self.chunks: deque[TensorDictBase] = deque()
         self.steps: Steps
+        self.layout: Layout
 
     @property
     def count(self) -> int:
         """Rows held."""
         return len(self.steps.last) if self.chunks else 0
 
+    def copy(self) -> "UnfinishedEpisode":
+        """Returns one that holds the same rows; no tensor is copied, for none is ever written into."""
+        twin = UnfinishedEpisode()
+        if self.chunks:
+            twin.chunks, twin.steps, twin.layout = self.chunks.copy(), self.steps, self.layout
+        return twin
+
     def count_known(self, max_distance: int) -> int:
         """Rows, from the first on, whose next ``max_distance`` poses are known, or all those to their episode's end."""
         ended = self.steps.last.nonzero()
         return max(int(ended[-1]) + 1 if len(ended) else 0, self.count - max_distance + 1, 0)
 
-    def append(self, rows: TensorDictBase, steps: Steps) -> None:
-        """Adds rows ``[T]``."""
+    def append(self, rows: TensorDictBase, steps: Steps, layout: Layout) -> None:
+        """Adds rows ``[T]`` of a layout."""
         held = (self.steps, steps) if self.chunks else (steps,)
         self.steps = Steps(*(torch.cat(entries) for entries in zip(*held, strict=True)))
         self.chunks.append(rows)
+        self.layout = layout
 
     def pop(self, count: int) -> list[TensorDictBase]:
         """Takes the first ``count`` rows away, as consecutive chunks."""
@@ -96,7 +116,24 @@ class UnfinishedEpisode:
 
 
 def concatenate(chunks: list[TensorDictBase]) -> TensorDictBase | None:
-    """Joins chunks of rows; None if there are none."""
-    if not chunks:
-        return None
-    return chunks[0] if len(chunks) == 1 else torch.cat(chunks)
+    """Joins chunks of rows; None if there are none.
+
+    A TensorDict's device is a label that may be missing, and collectors set it only from their second batch on: chunks
+    with different labels all get one.
+    """
+    if len(chunks) < 2:
+        return chunks[0] if chunks else None
+    labels = {label for chunk in chunks for label in _devices(chunk)}
+    if len(labels) > 1:
+        device = next(label for label in labels if label is not None)
+        chunks = [chunk.to(device) for chunk in chunks]
+    return torch.cat(chunks)
+
+
+def _devices(rows: TensorDictBase) -> set[torch.device | None]:
+    """Returns the device labels of a TensorDict and of those inside it."""
+    labels = {rows.device}
+    for value in rows.values():
+        if isinstance(value, TensorDictBase):
+            labels |= _devices(value)
+    return labels
