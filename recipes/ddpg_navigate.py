@@ -2,105 +2,107 @@
 
 Usage::
 
-    python recipes/ddpg_navigate.py                                   # HALGAN, 2 m room, shipped weights
-    python recipes/ddpg_navigate.py --hindsight oracle --seed 1       # the simulator itself paints the goal
-    python recipes/ddpg_navigate.py --hindsight none                  # plain DDPG: never sees a reward
-    python recipes/ddpg_navigate.py --preset paper                    # the paper's appendix, in its 4 m room
+    python recipes/ddpg_navigate.py                                # HALGAN, 2 m room, shipped weights
+    python recipes/ddpg_navigate.py --method oracle --seed 1       # the simulator itself paints the goal
+    python recipes/ddpg_navigate.py --method none                  # plain DDPG: never sees a reward
+    python recipes/ddpg_navigate.py --preset 4m                    # the paper's 4 m room, on two cores
+    python recipes/ddpg_navigate.py --preset paper                 # the paper's appendix
 
-Every run writes into its own folder: ``config.json``, ``metrics.csv``, ``policy.safetensors`` (with its manifest),
-``curve.png``, ``agent.gif`` and ``hallucinations.png``. ``recipes/play.py`` plays the saved policy.
-
-Metrics, one row an evaluation:
+Every run writes a folder: ``config.json``, ``metrics.csv``, ``policy.safetensors`` with its manifest, ``curve.png``,
+``agent.gif`` and ``hallucinations.png``. ``recipes/play.py`` plays the saved policy. Metrics, one row an evaluation:
 
 ==============================  ====================================================================
 ``frames``, ``seconds``         environment steps; wall time from the start until they were evaluated
-``eval/success_rate``           deterministic policy, share of the fixed starts that reach the box
+``eval/success_rate``           fraction of the fixed starts that the deterministic policy solves
 ``eval/return``                 mean undiscounted return
 ``eval/episode_length``         mean steps
-``train/success_rate``          share of the exploring episodes since the last evaluation that reach the box
-``train/hallucinated_fraction`` share of the sampled rows that were relabelled since the last evaluation
+``train/success_rate``          fraction of the exploring episodes since the last evaluation that succeed
+``train/hallucinated_fraction`` fraction of the sampled rows that were relabelled since the last evaluation
 ``train/q_value``, ``.../loss`` mean over the updates since the last evaluation
-``train/epsilon``               share of uniformly random actions
+``train/epsilon``               fraction of uniformly random actions
 ==============================  ====================================================================
 
 Differences from the paper (Sahni et al., NeurIPS 2019, appendix), all undone by ``--preset paper``:
 
-1. A 2 m room and starts at least 0.5 m from the box instead of 4 m and 1 m.
-2. Strided convolutions instead of max-pooling (as many parameters; the paper tells neither): less than half the time.
-3. Learning rates 1e-4 and 1e-3 instead of 1e-5 and 1e-4.
-4. Discount 0.95 instead of 0.99: one step then changes a value by 5 % and not by 1 %, which is more than the critic's
-   error, and values that it makes up decay. Target rate 1e-1 instead of 1e-3: values spread, and decay, that much
-   faster. With 2e-2 a robot that had come to stand still or to dither did so for thousands of frames.
-5. Targets clipped to [-1, 1], the range of any return.
-6. A price on the square of the actor's pre-activations: without it the tanh saturates within 500 updates, everywhere.
-   It is 1e-4: 1e-3 outweighs what a turn is worth that may bring the box into view.
-7. Goals up to 96 steps ahead instead of 32, but near ones preferred (steps to the goal: uniform squared), so that goals
-   are also seen from afar, and more of the relabelled rows are rewarded.
-8. Epsilon from 1 to 0.1 over 6,000 frames instead of to 0.5 over 100,000; 2,000 warm-up frames, not 10,000. Policies
-   that fail mostly stand in a corner and turn to and fro; they unlearn it sooner the more they act by themselves.
-9. Relabelling decays over 60,000 frames instead of 100,000 (which the paper does not state; its epsilon's span).
-10. The shipped generator is this library's (see ``recipes/train_halgan.py``); ``--weights`` takes any other. Its
-    output is tabulated once and then looked up (`halgan_rl.hallucination.bank`); ``--no-bank`` asks the generator.
-    Both images of a row show one latent's goal (the paper does not tell; its preset draws one for each image).
-11. The actor's last layer starts near zero, as in DDPG's own paper: without it an untrained robot may drive in circles
-    that meet the box by chance (8 % of the starts with seed 0).
-12. A moving average of the actor's weights, over some 500 updates, is what is evaluated and saved. The policy that
-    explores is the last one: in the 4 m room its success swings (56,000 and 58,000 frames: 88 and 20 %; the average's:
-    94 and 86 %).
-13. Goals that the image does not show are not pursued. Where an unseen goal is, nothing in the image tells; in
-    hindsight it is where the robot went. So such rows praise going where it always goes, and that may be a corner in
-    which it then stands.
+1. The room is 2 m wide and starts are at least 0.5 m from the box, instead of 4 m and 1 m.
+2. Convolutions have stride 2 instead of max-pooling. The paper gives neither; the parameters are as many.
+3. Learning rates are 1e-4 and 1e-3 instead of 1e-5 and 1e-4.
+4. The discount is 0.95 instead of 0.99: a step changes a value by more than the critic's error. Tau is 1e-1 instead of
+   1e-3: values spread, and made-up values decay, that much faster (4m: 2e-2).
+5. Targets are clipped to [-1, 1], the range of any return.
+6. The square of the actor's pre-activations has a penalty weight of 1e-4 (4m: 1e-3). Without it the tanh saturates
+   within 500 updates.
+7. Goals lie up to 96 steps ahead instead of 32, and near ones are preferred (steps to the goal: uniform squared).
+8. Epsilon falls from 1 to 0.1 over 6,000 frames instead of to 0.5 over 100,000 (4m: over 30,000). The warm-up has 2,000
+   frames instead of 10,000.
+9. Relabelling decays over 60,000 frames instead of 100,000 (4m: 200,000). The paper does not give the span; its preset
+   has that of its epsilon.
+10. The generator is this library's (``recipes/train_generator.py``). Its output is tabulated once and looked up. Both
+    images of a row show one latent's goal; the paper's preset draws a latent for each image.
+11. The actor's last layer starts near zero, as in DDPG's own paper.
+12. A moving average of the actor's weights, over some 500 updates, is evaluated and saved.
+13. Goals that the image does not show are not pursued (4m: they are).
+14. In the 4m preset there is one update every 2 frames instead of every frame.
 
-In both rooms the rover has no reverse gear, action -1 is rest and +1 full speed: a random walk that reverses takes half
-of its hindsight goals from behind the robot, where no camera sees them (``halgan_envs.make(..., reverse_speed=0.5)`` gives it
-one).
+The rover has no reverse gear: action -1 is rest and +1 full speed. A random walk that reverses takes half of its
+hindsight goals from behind the robot, where no camera sees them.
 """
 
-import dataclasses
+from dataclasses import replace
 from pathlib import Path
 
 import halgan_envs
 
-from halgan_rl.agents.ddpg import PAPER, DDPGConfig, make_agent
+from halgan_rl.agents.ddpg import PAPER, DDPGConfig
+from halgan_rl.experiment.config import PAPER_PAINTER, PAPER_TRAINING, HindsightConfig, RunConfig
+from halgan_rl.experiment.methods import make_hindsight
 from halgan_rl.experiment.presets import parse_config
-from halgan_rl.experiment.run import run
+from halgan_rl.experiment.run import Run, make_agent, make_buffer, prepare
+from halgan_rl.training.loop import TrainingConfig
+from halgan_rl.transforms.annealing import Annealing
+
+DEFAULT = RunConfig(
+    out=Path("runs/ddpg_navigate"),
+    agent=DDPGConfig(tau=1e-1, preactivation_weight=1e-4),
+    hindsight=HindsightConfig(pursue_unseen=False),
+)
+LARGE_ROOM = RunConfig(
+    preset="4m",
+    environment="navigate-4m",
+    total_frames=100_000,
+    out=DEFAULT.out,
+    agent=DDPGConfig(epsilon=Annealing(1.0, 0.1, 30_000)),
+    hindsight=HindsightConfig(probability=Annealing(0.3, 0.0, 200_000)),
+    training=TrainingConfig(frames_per_update=2),
+)
+PAPER_RUN = RunConfig(
+    preset="paper",
+    environment="navigate-4m",
+    total_frames=250_000,
+    out=DEFAULT.out,
+    agent=replace(PAPER, epsilon=Annealing(1.0, 0.5, 100_000)),
+    hindsight=HindsightConfig(probability=Annealing(0.3, 0.0, 100_000), max_distance=32, nearness=1.0),
+    painter=PAPER_PAINTER,
+    training=PAPER_TRAINING,
+)
+PRESETS = {"default": DEFAULT, "4m": LARGE_ROOM, "paper": PAPER_RUN}
 
 
-@dataclasses.dataclass(frozen=True)
-class Config(DDPGConfig):
-    """Visual navigation with DDPG and hindsight."""
+def main(config: RunConfig) -> None:
+    """Trains, evaluates, and writes everything into `config.out`."""
+    prepare(config)
+    domain = halgan_envs.domain(config.environment)
 
-    out: Path = Path("runs/ddpg_navigate")
-    """Folder of the run; must not hold one yet."""
-    target_rate: float = 1e-1
-    """How far the target networks move towards the networks at each update."""
-    preactivation_weight: float = 1e-4
-    """Price of the square of what goes into the actor's tanh."""
-    pursue_unseen: bool = False
-    """Also pursue hindsight goals that the image does not show."""
+    # The agent, what relabels failed rows, and the replay buffer in which it does.
+    agent = make_agent(config, domain)
+    hindsight = make_hindsight(config, domain)
+    buffer = make_buffer(config.training, hindsight, seed=config.seed)
 
-
-PRESETS = {
-    "default": Config(),
-    "paper": Config(
-        **PAPER,
-        preset="paper",
-        environment="navigate-4m",
-        total_frames=250_000,
-        max_distance=32,
-        epsilon_frames=100_000,
-        hallucination_frames=100_000,
-    ),
-}
-
-
-def main(config: Config) -> None:
-    """Train, evaluate, and write everything into `config.out`."""
-    success = run(config, make_agent, halgan_envs)
-    print(
-        f"success rate {success:.0%} after {config.total_frames} frames; pictures and weights in {config.out}\n"
-        f"next: python recipes/play.py --run {config.out}"
-    )
+    # Training, with evaluation beside it; then the pictures.
+    with Run(config, domain, agent, buffer, hindsight) as run:
+        run.train()
+    run.draw()
+    print(run.summary())
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Play a saved policy and report its success rate.
+"""Plays a saved policy and reports its success rate.
 
 Usage::
 
     python recipes/play.py --run runs/ddpg_navigate                  # 100 starts that training never evaluated on
-    python recipes/play.py --run runs/ddpg_navigate --gif agent.gif  # and film the first five
+    python recipes/play.py --run runs/ddpg_navigate --gif agent.gif  # and films the first five
 """
 
 import dataclasses
@@ -14,48 +14,42 @@ import halgan_envs
 import torch
 import tyro
 
-from halgan_rl.agents.networks import Actor, QNetwork, deterministic_policy, greedy_policy
 from halgan_rl.experiment import pictures
-from halgan_rl.hallucination.weights import load_module, read_manifest
+from halgan_rl.experiment.policy import load_policy
 from halgan_rl.training.evaluation import evaluate, record
-
-POLICIES = {Actor.kind: (Actor, deterministic_policy), QNetwork.kind: (QNetwork, greedy_policy)}
-"""Kind of a saved network: how it is rebuilt, and how it acts."""
-FIRST_SEED = 20_000
-"""Seed of the first start; the starts of training's own evaluations lie below."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Play a saved policy and report its success rate."""
+    """Plays a saved policy and reports its success rate."""
 
     run: Path
     """Folder of a run, which holds `policy.safetensors`."""
     starts: int = 100
     """Episodes to play, each from a start of its own."""
-    first_seed: int = FIRST_SEED
-    """Seed of the first start."""
+    first_seed: int = 20_000
+    """Seed of the first start; the starts of training's own evaluations lie below."""
     gif: Path | None = None
     """Film the first five episodes into this file."""
 
 
 def main(config: Config) -> None:
-    """Evaluate the policy of a run, and film it if asked to."""
+    """Evaluates the policy of a run, and films it if a file is given."""
     torch.set_num_threads(1)  # as in training: more do not help networks this small
     path = config.run / "policy.safetensors"
-    build, make_policy = POLICIES[read_manifest(path)["kind"]]
-    network, manifest = load_module(path, build)
-    policy = make_policy(network)
-    env = halgan_envs.make(manifest["environment"])
+    policy, manifest = load_policy(path)
+    domain = halgan_envs.domain(manifest["environment"])
+    env = domain.make()
+
     seeds = range(config.first_seed, config.first_seed + config.starts)
-    result = evaluate(env, policy, seeds=seeds)
+    result = evaluate(env, policy, seeds=seeds, poses=domain.poses, keys=domain.keys)
     print(
-        f"{path} in {manifest['environment']}: success rate {result.success_rate:.1%} over {config.starts} starts, "
+        f"{path} in {domain.name}: success rate {result.success_rate:.1%} over {config.starts} starts, "
         f"mean return {result.episode_return:.3f}, mean episode {result.episode_length:.1f} steps"
     )
     if config.gif is not None:
-        film = record(env, policy, partial(env.render_overview, 256, 320), seeds=seeds[:5])
-        pictures.write_gif(config.gif, film)
+        overview = domain.overview and partial(domain.overview, env, 256, 320)
+        pictures.write_gif(config.gif, record(env, policy, overview, seeds=seeds[:5], keys=domain.keys))
         print(f"film: {config.gif}")
     env.close()
 

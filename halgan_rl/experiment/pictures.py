@@ -14,7 +14,7 @@ Curve = Mapping[str, Sequence[float]]
 def draw_learning_curves(
     path: Path, methods: Mapping[str, Sequence[Curve]], *, title: str, column: str = "eval/success_rate"
 ) -> None:
-    """Draw one column of the runs' metrics over frames; runs of one method share a colour, their mean is bold.
+    """Draws one column of the runs' metrics over frames; runs of one method share a colour, their mean is bold.
 
     Args:
         path: the PNG to write.
@@ -37,13 +37,14 @@ def draw_learning_curves(
     figure.savefig(path, dpi=120)
 
 
-def draw_frame_grid(path: Path, rows: Mapping[str, Tensor], *, title: str) -> None:
-    """Draw labelled rows of frames.
+def draw_frame_grid(path: Path, rows: Mapping[str, Tensor], *, title: str, frame_stack: int = 1) -> None:
+    """Draws labelled rows of frames.
 
     Args:
         path: the PNG to write.
-        rows: for each label, frames ``[N, H, W, 3]`` uint8; all rows have the same N.
+        rows: for each label, frames ``[N, H, W, C]`` uint8; all rows have the same N.
         title: heading of the picture.
+        frame_stack: frames stacked along C, of which the last is shown.
     """
     columns = len(next(iter(rows.values())))
     figure = Figure(figsize=(1.1 * columns + 1.2, 1.2 * len(rows) + 0.4), layout="constrained")
@@ -52,11 +53,17 @@ def draw_frame_grid(path: Path, rows: Mapping[str, Tensor], *, title: str) -> No
     for axes_row, (label, frames) in zip(grid, rows.items(), strict=True):
         axes_row[0].set_ylabel(label, rotation=0, ha="right", va="center", fontsize=9)
         for axes, frame in zip(axes_row, frames, strict=True):
-            axes.imshow(frame.numpy(), interpolation="nearest")
+            axes.imshow(_shown(frame, frame_stack), interpolation="nearest", cmap="gray", vmin=0, vmax=255)
             axes.set(xticks=[], yticks=[])
     figure.savefig(path, dpi=120)
 
 
+def _shown(frame: Tensor, frame_stack: int) -> np.ndarray:
+    """The last of the frames stacked in ``[H, W, C]``: ``[H, W, 3]``, or ``[H, W]`` if it is grey."""
+    channels = frame.shape[-1] // frame_stack
+    return frame[..., -channels:].squeeze(-1).numpy()
+
+
 def write_gif(path: Path, frames: Sequence[np.ndarray], *, frames_per_second: float = 20.0) -> None:
-    """Write frames ``[H, W, 3]`` uint8 as an endlessly looping GIF."""
+    """Writes frames ``[H, W, 3]`` uint8 as an endlessly looping GIF."""
     iio.imwrite(path, np.stack(list(frames)), extension=".gif", duration=1000.0 / frames_per_second, loop=0)

@@ -1,133 +1,64 @@
-"""An agent trained with hindsight, from its configuration to its pictures: what the recipes for agents share.
-
-Knows no simulator: the recipes pass one, see :class:`Simulator`.
-"""
+"""A run: a folder in which an agent is trained, judged and shown."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from functools import partial
 from importlib.util import find_spec
-from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from types import TracebackType
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.collectors import BaseCollector, Collector
-from torchrl.data import TensorDictReplayBuffer, TensorSpec
-from torchrl.envs import Compose, EnvBase, ExcludeTransform
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.envs import ExcludeTransform
 from torchrl.record.loggers import Logger
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
+from halgan_rl.agents.agent import Agent
+from halgan_rl.agents.fast_cpu import accelerate
+from halgan_rl.agents.registry import make_agent as make_plain_agent
 from halgan_rl.experiment import pictures
-from halgan_rl.experiment.config import HindsightConfig
-from halgan_rl.experiment.metrics import Report
+from halgan_rl.experiment.config import RunConfig
+from halgan_rl.experiment.domain import Domain
 from halgan_rl.experiment.run_folder import RunFolder, check_unused, read_metrics, versions
-from halgan_rl.hallucination.bank import BankGrid, HallucinationBank
-from halgan_rl.hallucination.hallucinators import GanHallucinator, Hallucinator, RandomFlags
-from halgan_rl.hallucination.weights import load_generator, save_weights, shipped_weights
-from halgan_rl.poses import PoseTolerance
+from halgan_rl.hallucination.weights import save_weights
 from halgan_rl.replay.frame_storage import FrameStorage
 from halgan_rl.training.background_collector import BackgroundCollector
 from halgan_rl.training.evaluation import Evaluation, record
 from halgan_rl.training.evaluation_process import EvaluationProcess, evaluate_at_once
-from halgan_rl.training.loop import COLUMNS, Agent, Schedule, train
-from halgan_rl.transforms import pipelines
-
-
-class Simulator(Protocol):
-    """What is asked of a simulator, such as the package ``envs``. Environments go by names."""
-
-    def make(self, name: str, *, seed: int | None = None) -> EnvBase:
-        """Make an environment with ``pixels`` and ``pose``, and ``render_overview(height, width)`` for people."""
-
-    def fingerprint(self, name: str) -> Mapping[str, str]:
-        """Return what its images depend on, see :func:`halgan_rl.hallucination.weights.load_generator`."""
-
-    def pose_flags(self, name: str) -> Sequence[str]:
-        """Return the names of the entries of its poses after x, y and yaw."""
-
-    def goal_offsets(self, name: str) -> tuple[float, ...]:
-        """Return how far ahead of a goal pose the goal stands [m], for each setting of the flags."""
-
-    def GoalRenderer(self, name: str) -> Hallucinator:
-        """Return an oracle: what paints the goal as the simulator shows it."""
-
+from halgan_rl.training.loop import COLUMNS, TrainingConfig, train
+from halgan_rl.training.metrics import Report
+from halgan_rl.transforms import Hallucinator
+from halgan_rl.transforms.pipelines import Hindsight
 
 EVALUATION_SEED = 10_000
 """Seed of the first fixed start; training seeds are far below."""
+OVERVIEW = (256, 320)
+"""Height and width of the view from outside in films [pixels]."""
 
-Config = TypeVar("Config", bound=HindsightConfig)
 
-
-def run(config: Config, make_agent: Callable[[Config, TensorSpec], Agent], simulator: Simulator) -> float:
-    """Train an agent, evaluate it, and write everything into `config.out`.
-
-    Args:
-        config: what to do.
-        make_agent: makes the agent for a configuration and the environment's actions.
-        simulator: where the environments are from.
-
-    Returns:
-        The success rate at the end.
+def prepare(config: RunConfig) -> None:
+    """Refuses what cannot work, and seeds PyTorch; the first line of a recipe.
 
     Raises:
-        FileExistsError: if `config.out` already holds anything.
-        ValueError: if the environment is unknown, the weights do not fit it, or the device cannot be used.
+        FileExistsError: if the folder of the run already holds anything.
+        ValueError: if the device cannot be used.
+        ImportError: if TensorBoard is to be used and is not installed.
     """
     check_unused(config.out)
     check_device(config.device)
+    if config.tensorboard and find_spec("tensorboard") is None:
+        raise ImportError("--tensorboard needs the extra: pip install 'halgan-rl[tensorboard]'")
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
 
-    # The environment and the agent.
-    env = simulator.make(config.environment, seed=config.seed)
-    agent = make_agent(config, env.action_spec)
-    if config.compile != "no":
-        agent.loss.compile(mode=config.compile)
-    flags = simulator.pose_flags(config.environment)
-    evaluator = make_evaluator(config, simulator, flags)
-
-    # Replay with hindsight: failed rows come out of the buffer as successes.
-    with torch.random.fork_rng(devices=[]):  # With one seed all methods explore alike, whatever a painter draws.
-        hallucinator = make_hallucinator(config, simulator)
-    hindsight = make_hindsight(config, hallucinator)
-    buffer = make_buffer(config, hindsight)
-
-    # Learning.
-    with ExitStack() as stack:
-        evaluate = stack.enter_context(evaluator)
-        folder = make_folder(config, agent, flags)
-        collector = make_collector(config, simulator, env, agent.explorer)
-        stack.callback(collector.shutdown)
-        policy = train(
-            agent,
-            collector,
-            buffer,
-            hindsight=hindsight,
-            schedule=Schedule(
-                config.total_frames, config.warmup_frames, config.frames_per_update, config.evaluate_every
-            ),
-            batch_size=config.batch_size,
-            policy_average=config.policy_average,
-            evaluate=evaluate,
-            report=Report(folder, make_tensorboard(config)),
-            save=partial(save_policy, folder, config, simulator),
-            label=config.hindsight,
-        )
-
-    # Pictures.
-    draw_pictures(folder, config, simulator.make(config.environment), policy)
-    if hallucinator is not None:
-        painters = {"true goal": simulator.GoalRenderer(config.environment), config.hindsight: hallucinator}
-        draw_hallucinations(folder.file("hallucinations.png"), config, buffer, painters)
-    return read_metrics(folder.file("metrics.csv"))["eval/success_rate"][-1]
-
 
 def check_device(device: str) -> None:
-    """Refuse a device that PyTorch cannot use here."""
+    """Refuses a device that PyTorch cannot use here."""
     try:
         torch.zeros(1, device=device).cpu()
     except (AssertionError, ImportError, NotImplementedError, RuntimeError) as error:
@@ -135,151 +66,187 @@ def check_device(device: str) -> None:
         raise ValueError(f"device={device!r} cannot be used here ({reason}): choose 'cpu'") from error
 
 
-def make_hallucinator(config: HindsightConfig, simulator: Simulator) -> Hallucinator | None:
-    """Return who paints the goal; weights that do not fit the environment are refused here."""
-    if config.hindsight == "none":
-        return None
-    rng = torch.Generator().manual_seed(config.seed)
-    if config.hindsight == "oracle":
-        painter = simulator.GoalRenderer(config.environment)
-    else:
-        painter = make_painter(config, simulator, rng)
-    return RandomFlags(painter, rng=rng) if config.random_flags else painter
+def make_agent(config: RunConfig, domain: Domain) -> Agent:
+    """Returns the configured agent for the actions and images of a domain.
 
-
-def make_painter(config: HindsightConfig, simulator: Simulator, rng: torch.Generator) -> Hallucinator:
-    """Return what paints with a generator: its bank, or the generator itself."""
-    path = config.weights or shipped_weights(config.environment)
-    generator = load_generator(
-        path,
-        expected=simulator.fingerprint(config.environment),
-        pose_size=3 + len(simulator.pose_flags(config.environment)),
-        allow_other_mujoco=config.allow_other_mujoco,
-    )
-    if config.bank:
-        grid = BankGrid(goal_offset=simulator.goal_offsets(config.environment))
-        return HallucinationBank(generator, grid, rng=rng, share_latent=config.share_latent)
-    return GanHallucinator(generator, rng=rng, share_latent=config.share_latent)
-
-
-def make_hindsight(config: HindsightConfig, hallucinator: Hallucinator | None) -> Compose | None:
-    """Return the replay transform of the chosen method."""
-    if hallucinator is None:
-        return None
-    pipeline = pipelines.oracle if config.hindsight == "oracle" else pipelines.halgan
-    return pipeline(
-        hallucinator,
-        max_distance=config.max_distance,
-        nearness=config.nearness,
-        probability=config.hallucination_start,
-        final_probability=config.hallucination_end,
-        annealing_steps=config.hallucination_frames,
-        tolerance=PoseTolerance(config.goal_distance, config.goal_angle),
-        pursue_unseen=config.pursue_unseen,
-        generator=torch.Generator().manual_seed(config.seed),
-    )
-
-
-def make_collector(
-    config: HindsightConfig, simulator: Simulator, env: EnvBase, explorer: TensorDictModuleBase
-) -> BaseCollector:
-    """Return what steps the environment: uniformly random actions first, then the exploring policy.
-
-    In the background it steps one like it, and closes `env`.
+    Raises:
+        ValueError: if the algorithm does not fit the actions.
     """
+    agent = make_plain_agent(
+        config.agent,
+        action_spec=domain.action_spec,
+        image_shape=domain.image_shape,
+        keys=domain.keys,
+        device=config.device,
+    )
+    if config.fast_cpu:
+        accelerate(agent)
+    if config.compile != "no":
+        agent.loss.compile(mode=config.compile)
+    return agent
+
+
+def make_buffer(config: TrainingConfig, hindsight: Hindsight, *, seed: int) -> TensorDictReplayBuffer:
+    """Returns the replay buffer; its room for final frames suffices for episodes of four steps on average."""
+    return TensorDictReplayBuffer(
+        storage=FrameStorage(config.replay_capacity, extra_frames=config.replay_capacity // 4, keys=hindsight.keys),
+        transform=hindsight,
+        generator=torch.Generator().manual_seed(seed),
+    )
+
+
+class Run:
+    """Trains an agent in a folder of its own: configuration, metrics, weights, pictures.
+
+    Entering it starts the evaluation and makes the folder; leaving it ends all processes.
+
+    Args:
+        config: what to do.
+        domain: the environment.
+        agent: learns, in place.
+        buffer: replays.
+        hindsight: the buffer's pipeline.
+    """
+
+    def __init__(
+        self, config: RunConfig, domain: Domain, agent: Agent, buffer: TensorDictReplayBuffer, hindsight: Hindsight
+    ) -> None:
+        self.config, self.domain, self.agent, self.buffer, self.hindsight = config, domain, agent, buffer, hindsight
+        self._stack = ExitStack()
+
+    def __enter__(self) -> "Run":
+        with ExitStack() as stack:  # undone if anything below fails
+            self._evaluate = stack.enter_context(make_evaluator(self.config, self.domain))
+            self.folder = self._make_folder()
+            self._collector = make_collector(self.config, self.domain, self.agent.explorer)
+            stack.callback(self._collector.shutdown)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)
+
+    def train(self) -> None:
+        """Trains for as long as the configuration says; metrics and weights are written at each evaluation."""
+        self.policy = train(
+            self.agent,
+            self._collector,
+            self.buffer,
+            self.hindsight,
+            self.config.training,
+            total_frames=self.config.total_frames,
+            evaluate_every=self.config.evaluation.every,
+            evaluate=self._evaluate,
+            report=Report(self.folder.columns, self.folder.write_metrics, make_tensorboard(self.config)),
+            save=self._save,
+            keys=self.domain.keys,
+            label=self.config.method,
+        )
+
+    def draw(self) -> None:
+        """Draws the learning curve and the hallucinations, and films the trained agent."""
+        curve = read_metrics(self.folder.file("metrics.csv"))
+        path = self.folder.file("curve.png")
+        pictures.draw_learning_curves(path, {self.config.method: [curve]}, title=self._title)
+        self._film()
+        self._draw_hallucinations()
+
+    def summary(self) -> str:
+        """Returns what a person wants to know at the end."""
+        success = read_metrics(self.folder.file("metrics.csv"))["eval/success_rate"][-1]
+        return (
+            f"success rate {success:.0%} after {self.config.total_frames} frames; pictures and weights in "
+            f"{self.config.out}\nnext: python recipes/play.py --run {self.config.out}"
+        )
+
+    @property
+    def _title(self) -> str:
+        return f"{self.domain.name}, {self.config.method}, seed {self.config.seed}"
+
+    def _make_folder(self) -> RunFolder:
+        shown = (f"train/{name}" for name in self.agent.metrics.values())
+        flags = (f"eval/{flag}" for flag in self.domain.poses.flags)
+        folder = RunFolder(self.config.out, columns=(*COLUMNS, *shown, *flags))
+        folder.write_config(dataclasses.asdict(self.config))
+        return folder
+
+    def _save(self, network: nn.Module) -> None:
+        """Writes ``policy.safetensors`` with all that is needed to rebuild and trust it."""
+        manifest = {
+            "kind": network.kind,
+            "arguments": network.arguments,
+            "environment": self.domain.name,
+            **self.domain.fingerprint,
+            "config": dataclasses.asdict(self.config),
+            "versions": versions(),
+        }
+        save_weights(self.folder.file("policy.safetensors"), network, manifest)
+
+    def _film(self) -> None:
+        env = self.domain.make()
+        overview = self.domain.overview and partial(self.domain.overview, env, *OVERVIEW)
+        starts = range(EVALUATION_SEED, EVALUATION_SEED + self.config.evaluation.film_starts)
+        film = record(
+            env, self.policy, overview, seeds=starts, keys=self.domain.keys, frame_stack=self.domain.frame_stack
+        )
+        pictures.write_gif(self.folder.file("agent.gif"), film)
+        env.close()
+
+    def _draw_hallucinations(self) -> None:
+        if (painter := self.hindsight.hallucinator) is None:
+            return
+        painters: dict[str, Hallucinator] = {self.config.method: painter}
+        if self.domain.goal_renderer is not None:
+            painters = {"true goal": self.domain.goal_renderer(), **painters}
+        rows = paint_stored_rows(self.buffer, painters, domain=self.domain, steps=self.config.hindsight.max_distance)
+        path = self.folder.file("hallucinations.png")
+        pictures.draw_frame_grid(path, rows, title=self._title, frame_stack=self.domain.frame_stack)
+
+
+def paint_stored_rows(
+    buffer: TensorDictReplayBuffer, painters: Mapping[str, Hallucinator], *, domain: Domain, steps: int
+) -> dict[str, torch.Tensor]:
+    """Returns some stored frames ``[N, H, W, C]`` as they were, and with a goal some steps ahead by each painter."""
+    keys, steps = domain.keys, min(12, steps)
+    rows = buffer.storage[torch.linspace(0, len(buffer) - 1, 200).long()]  # past the transform, which would relabel
+    rows = rows[rows[keys.hindsight_horizon].squeeze(-1) >= steps][::16]
+    goal = rows[keys.hindsight_pose][:, [steps - 1]]
+    frames, poses = rows[keys.pixels].unsqueeze(1), rows[keys.pose].unsqueeze(1)
+    painted = {label: painter(frames, poses, goal).squeeze(1) for label, painter in painters.items()}
+    return {"failed": rows[keys.pixels], **painted}
+
+
+def make_collector(config: RunConfig, domain: Domain, explorer: TensorDictModuleBase) -> BaseCollector:
+    """Returns what steps the environment: uniformly random actions first, then the exploring policy."""
     settings: dict[str, Any] = {
-        "frames_per_batch": config.frames_per_batch,
+        "frames_per_batch": config.training.frames_per_batch,
         "total_frames": config.total_frames,
-        "init_random_frames": config.warmup_frames,
+        "init_random_frames": config.training.warmup_frames,
     }
-    if not config.background_collection:
+    if not config.training.background_collection:
+        env = domain.make(seed=config.seed)
         return Collector(env, explorer, track_traj_ids=False, auto_register_policy_transforms=False, **settings)
-    env.close()
     collector = BackgroundCollector(
-        partial(simulator.make, config.environment),
-        explorer,
-        postproc=ExcludeTransform("collector"),
-        num_threads=config.threads,
-        **settings,
+        domain.make, explorer, postproc=ExcludeTransform("collector"), num_threads=config.threads, **settings
     )
     collector.set_seed(config.seed)
     return collector
 
 
-def make_folder(config: HindsightConfig, agent: Agent, flags: Sequence[str]) -> RunFolder:
-    """Return the run's folder, with its configuration."""
-    columns = (*COLUMNS, *(f"train/{name}" for name in agent.figures.values()), *(f"eval/{flag}" for flag in flags))
-    folder = RunFolder(config.out, columns=columns)
-    folder.write_config(dataclasses.asdict(config))
-    return folder
-
-
-def make_buffer(config: HindsightConfig, hindsight: Compose | None) -> TensorDictReplayBuffer:
-    """Return the replay buffer; room for final frames suffices for episodes of four steps on average."""
-    return TensorDictReplayBuffer(
-        storage=FrameStorage(config.replay_capacity, extra_frames=config.replay_capacity // 4),
-        transform=hindsight,
-        generator=torch.Generator().manual_seed(config.seed),
-    )
-
-
-def make_tensorboard(config: HindsightConfig) -> Logger | None:
-    """Return TorchRL's TensorBoard logger if it was asked for."""
-    if not config.tensorboard:
-        return None
-    if find_spec("tensorboard") is None:
-        raise ImportError("--tensorboard needs the extra: pip install 'halgan-rl[tensorboard]'")
-    return TensorboardLogger(exp_name="tensorboard", log_dir=str(config.out))
-
-
 Evaluator = Callable[[TensorDictModuleBase], Future[Evaluation]]
 
 
-def make_evaluator(
-    config: HindsightConfig, simulator: Simulator, flags: Sequence[str]
-) -> AbstractContextManager[Evaluator]:
-    """Return what judges policies on the fixed starts: beside training, or at once."""
-    make_env = partial(simulator.make, config.environment)
-    starts = range(EVALUATION_SEED, EVALUATION_SEED + config.evaluation_starts)
-    if config.background_evaluation:
-        return EvaluationProcess(make_env, threads=config.threads, seeds=starts, flags=flags)
-    return nullcontext(partial(evaluate_at_once, make_env(), seeds=starts, flags=flags))
+def make_evaluator(config: RunConfig, domain: Domain) -> AbstractContextManager[Evaluator]:
+    """Returns what judges policies on the fixed starts: beside training, or at once."""
+    starts = range(EVALUATION_SEED, EVALUATION_SEED + config.evaluation.starts)
+    settings: dict[str, Any] = {"seeds": starts, "poses": domain.poses, "keys": domain.keys}
+    if config.evaluation.background:
+        return EvaluationProcess(domain.make, threads=config.threads, **settings)
+    return nullcontext(partial(evaluate_at_once, domain.make(), **settings))
 
 
-def save_policy(folder: RunFolder, config: HindsightConfig, simulator: Simulator, network: nn.Module) -> None:
-    """Write `policy.safetensors` with all that is needed to rebuild and trust it."""
-    manifest = {
-        "kind": network.kind,
-        "arguments": network.arguments,
-        **simulator.fingerprint(config.environment),
-        "config": dataclasses.asdict(config),
-        "versions": versions(),
-    }
-    save_weights(folder.file("policy.safetensors"), network, manifest)
-
-
-def draw_pictures(folder: RunFolder, config: HindsightConfig, env: EnvBase, policy: TensorDictModuleBase) -> None:
-    """Draw the learning curve, and film the trained agent."""
-    curve = read_metrics(folder.file("metrics.csv"))
-    pictures.draw_learning_curves(folder.file("curve.png"), {config.hindsight: [curve]}, title=title_of(config))
-    starts = range(EVALUATION_SEED, EVALUATION_SEED + config.film_starts)
-    film = record(env, policy, partial(env.render_overview, 256, 320), seeds=starts)
-    pictures.write_gif(folder.file("agent.gif"), film)
-
-
-def draw_hallucinations(
-    path: Path, config: HindsightConfig, buffer: TensorDictReplayBuffer, painters: Mapping[str, Hallucinator]
-) -> None:
-    """Draw stored rows: the frame as it was, a goal some steps ahead truly rendered, and as the agent is shown it."""
-    steps = min(12, config.max_distance)
-    rows = buffer.storage[torch.linspace(0, len(buffer) - 1, 200).long()]  # past the transform, which would relabel
-    rows = rows[rows["hindsight", "horizon"].squeeze(-1) >= steps][::16]
-    goal = rows["hindsight", "pose"][:, [steps - 1]]
-    frames, poses = rows["pixels"].unsqueeze(1), rows["pose"].unsqueeze(1)
-    painted = {label: painter(frames, poses, goal).squeeze(1) for label, painter in painters.items()}
-    pictures.draw_frame_grid(path, {"failed": rows["pixels"], **painted}, title=title_of(config))
-
-
-def title_of(config: HindsightConfig) -> str:
-    """Return what the pictures of a run are headed with."""
-    return f"{config.environment}, {config.hindsight}, seed {config.seed}"
+def make_tensorboard(config: RunConfig) -> Logger | None:
+    """Returns TorchRL's TensorBoard logger if the configuration wants one."""
+    return TensorboardLogger(exp_name="tensorboard", log_dir=str(config.out)) if config.tensorboard else None

@@ -31,47 +31,52 @@ class RunFolder:
             csv.writer(file).writerow(columns)
 
     def file(self, name: str) -> Path:
-        """Return the path of a file in the folder."""
+        """Returns the path of a file in the folder."""
         return self.path / name
 
     def write_config(self, config: dict[str, Any]) -> None:
-        """Write ``config.json``: the configuration, the command line and the versions it ran with."""
+        """Writes ``config.json``: the configuration, the command line and the versions it ran with."""
         write_json(
             self.file("config.json"),
             {"config": config, "command": shlex.join(sys.argv), "versions": versions()},
         )
 
     def write_metrics(self, row: dict[str, float]) -> None:
-        """Append one row to ``metrics.csv``; it is on disk when this returns.
+        """Appends one row to ``metrics.csv``; it is on disk when this returns.
 
         Raises:
             KeyError: if a column is missing from the row.
         """
         with self.file("metrics.csv").open("a", newline="") as file:
-            csv.writer(file).writerow([f"{row[column]:.6g}" for column in self.columns])
+            csv.writer(file).writerow([_written(row[column]) for column in self.columns])
+
+
+def _written(value: float) -> str:
+    """Whole numbers keep all their digits, others six of them."""
+    return str(value) if isinstance(value, int) else f"{value:.6g}"
 
 
 def check_unused(path: Path) -> None:
-    """Raise FileExistsError if the folder already holds anything."""
+    """Raises FileExistsError if the folder already holds anything."""
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise FileExistsError(f"{path} already holds a run; choose another --out, or remove it first")
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python, of this library and of everything it declares to need."""
+    """Returns the versions of Python, of this library and of everything it declares to need."""
     needed = [re.split(r"[^\w.-]", line)[0] for line in requires("halgan-rl") or [] if "extra ==" not in line]
     return {"python": sys.version.split()[0]} | {name: version(name) for name in ("halgan-rl", *needed)}
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write a JSON file atomically: a reader never meets a partial one."""
+    """Writes a JSON file atomically: a reader never meets a partial one."""
     temporary = path.with_name(path.name + ".partial")
     temporary.write_text(json.dumps(content, indent=2, default=str) + "\n")
     os.replace(temporary, path)
 
 
 def read_metrics(path: Path) -> dict[str, list[float]]:
-    """Read a ``metrics.csv`` as one list of floats a column."""
+    """Reads a ``metrics.csv`` as one list of floats a column."""
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     return {column: [float(row[column]) for row in rows] for column in rows[0]} if rows else {}

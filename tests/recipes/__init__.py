@@ -1,12 +1,36 @@
 """What tests of the recipes share."""
 
+import dataclasses
 from contextlib import AbstractContextManager
 from typing import Any
 from unittest import mock
 
-from halgan_rl.experiment import run as experiment
+from halgan_rl.experiment.run import Run
+
+TINY = {
+    "total_frames": 160,
+    "hindsight.max_distance": 32,
+    "painter.bank": False,
+    "training.warmup_frames": 64,
+    "training.batch_size": 8,
+    "training.replay_capacity": 200,
+    "evaluation.every": 80,
+    "evaluation.starts": 1,
+    "evaluation.film_starts": 1,
+    "evaluation.background": False,
+}
+"""Values of a run of a few seconds that reaches its updates."""
+
+
+def changed(config: Any, changes: dict[str, Any]) -> Any:
+    """Return a nested configuration with some values changed, named as on the command line."""
+    for name, value in changes.items():
+        first, _, rest = name.partition(".")
+        value = changed(getattr(config, first), {rest: value}) if rest else value
+        config = dataclasses.replace(config, **{first: value})
+    return config
 
 
 def without_pictures() -> AbstractContextManager[Any]:
-    """Return a context in which runs draw no curve and film nothing, which takes two fifths of a tiny one."""
-    return mock.patch.object(experiment, "draw_pictures")
+    """Return a context in which runs draw nothing and film nothing, which takes two fifths of a tiny one."""
+    return mock.patch.object(Run, "draw")

@@ -1,43 +1,33 @@
 """The recipe learns something, repeats itself, and refuses bad input before any work is done."""
 
-import dataclasses
 import json
 import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import halgan_envs
 import pytest
 import torch
 from safetensors.torch import load_file
 
+import tests.recipes
+from halgan_rl.experiment.methods import make_hindsight
 from halgan_rl.experiment.presets import parse_config
-from halgan_rl.experiment.run import make_hindsight
 from halgan_rl.experiment.run_folder import read_metrics
-from halgan_rl.poses import PoseTolerance
+from halgan_rl.transforms.annealing import Annealing
 from recipes import play
-from recipes.ddpg_navigate import PRESETS, Config, main
-from tests.recipes import without_pictures
+from recipes.ddpg_navigate import DEFAULT, PRESETS, main
+from tests.recipes import changed, without_pictures
 
-TINY = dataclasses.replace(
-    Config(),
-    total_frames=160,
-    warmup_frames=64,
-    max_distance=32,
-    batch_size=8,
-    replay_capacity=200,
-    evaluate_every=80,
-    evaluation_starts=1,
-    film_starts=1,
-    bank=False,
-    background_evaluation=False,
-)
+TINY = changed(DEFAULT, tests.recipes.TINY)
 
 
-def run(out: Path, **changes: object) -> dict[str, torch.Tensor]:
-    """Run the recipe, but for its pictures; return the policy that it saved."""
+def run(out: Path, changes: dict[str, Any] | None = None) -> dict[str, torch.Tensor]:
+    """Run the recipe without its pictures; return the policy that it saved."""
     with without_pictures():
-        main(dataclasses.replace(TINY, out=out, **changes))
+        main(changed(TINY, {"out": out, **(changes or {})}))
     return load_file(out / "policy.safetensors")
 
 
@@ -49,25 +39,25 @@ def differ(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> set[
 @pytest.fixture(scope="module")
 def halgan_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "halgan"
-    main(dataclasses.replace(TINY, out=out))
+    main(changed(TINY, {"out": out}))
     return out
 
 
 def test_every_parameter_of_the_policy_is_updated(halgan_run: Path, tmp_path: Path) -> None:
-    untrained = run(tmp_path / "untrained", total_frames=48, evaluate_every=48)
+    untrained = run(tmp_path / "untrained", {"total_frames": 48, "evaluation.every": 48})
     trained = load_file(halgan_run / "policy.safetensors")
     assert differ(trained, untrained) == set(trained)
 
 
 def test_the_average_of_the_policy_is_saved_not_the_last_one(halgan_run: Path, tmp_path: Path) -> None:
-    last = run(tmp_path / "last", policy_average=0.0)
+    last = run(tmp_path / "last", {"training.policy_average": 0.0})
     assert differ(load_file(halgan_run / "policy.safetensors"), last) == set(last)
 
 
 def test_all_methods_start_from_the_same_agent(tmp_path: Path) -> None:
     untrained = [
-        run(tmp_path / hindsight, hindsight=hindsight, total_frames=48, evaluate_every=48)
-        for hindsight in ("halgan", "none")
+        run(tmp_path / method, {"method": method, "total_frames": 48, "evaluation.every": 48})
+        for method in ("halgan", "none")
     ]
     assert differ(*untrained) == set()
 
@@ -86,7 +76,7 @@ def test_everything_promised_is_written(halgan_run: Path) -> None:
     metrics = read_metrics(halgan_run / "metrics.csv")
     assert metrics["frames"] == [80, 160]
     assert 0.05 < metrics["train/hallucinated_fraction"][-1] < 0.5
-    assert json.loads((halgan_run / "config.json").read_text())["config"]["hindsight"] == "halgan"
+    assert json.loads((halgan_run / "config.json").read_text())["config"]["method"] == "halgan"
 
 
 def test_a_run_repeats_itself_bit_for_bit(halgan_run: Path, tmp_path: Path) -> None:
@@ -98,7 +88,7 @@ def test_a_run_repeats_itself_bit_for_bit(halgan_run: Path, tmp_path: Path) -> N
 
 
 def test_evaluation_in_the_background_changes_nothing(halgan_run: Path, tmp_path: Path) -> None:
-    beside = run(tmp_path / "beside", background_evaluation=True)
+    beside = run(tmp_path / "beside", {"evaluation.background": True})
     assert differ(load_file(halgan_run / "policy.safetensors"), beside) == set()
     at_once, later = (read_metrics(path / "metrics.csv") for path in (halgan_run, tmp_path / "beside"))
     assert at_once.pop("seconds") != later.pop("seconds")
@@ -107,7 +97,7 @@ def test_evaluation_in_the_background_changes_nothing(halgan_run: Path, tmp_path
 
 
 def test_collection_in_the_background_repeats_itself_a_batch_behind(halgan_run: Path, tmp_path: Path) -> None:
-    one, other = (run(tmp_path / name, background_collection=True) for name in ("one", "other"))
+    one, other = (run(tmp_path / name, {"training.background_collection": True}) for name in ("one", "other"))
     assert differ(one, other) == set()
     assert differ(one, load_file(halgan_run / "policy.safetensors")) == set(one)
     metrics = read_metrics(tmp_path / "one" / "metrics.csv")
@@ -116,9 +106,10 @@ def test_collection_in_the_background_repeats_itself_a_batch_behind(halgan_run: 
 
 
 FAILING = """
-import dataclasses, pathlib, sys
-from halgan_rl.training.loop import Agent
+import pathlib, sys
+from halgan_rl.agents.agent import Agent
 from recipes.ddpg_navigate import main
+from tests.recipes import changed
 from tests.recipes.test_ddpg_navigate import TINY
 
 def fail(agent, batch):
@@ -126,8 +117,8 @@ def fail(agent, batch):
 
 if __name__ == "__main__":
     Agent.update = fail
-    both = {"background_collection": True, "background_evaluation": True}
-    main(dataclasses.replace(TINY, **both, out=pathlib.Path(sys.argv[1], "run")))
+    both = {"training.background_collection": True, "evaluation.background": True}
+    main(changed(TINY, {**both, "out": pathlib.Path(sys.argv[1], "run")}))
 """
 
 
@@ -144,11 +135,12 @@ def test_seed_and_method_change_what_is_learned(halgan_run: Path, tmp_path: Path
     trained = load_file(halgan_run / "policy.safetensors")
     for name, changes in {
         "seed": {"seed": 1},
-        "oracle": {"hindsight": "oracle"},
-        "none": {"hindsight": "none"},
-        "bank": {"bank": True},
+        "oracle": {"method": "oracle"},
+        "her": {"method": "her"},
+        "none": {"method": "none"},
+        "bank": {"painter.bank": True},
     }.items():
-        assert differ(trained, run(tmp_path / name, **changes)) == set(trained), name
+        assert differ(trained, run(tmp_path / name, changes)) == set(trained), name
     assert not (tmp_path / "none" / "hallucinations.png").exists()
     assert read_metrics(tmp_path / "none" / "metrics.csv")["train/hallucinated_fraction"][-1] == 0
 
@@ -160,74 +152,85 @@ def test_the_saved_policy_plays(halgan_run: Path, tmp_path: Path, capsys: pytest
 
 
 def test_what_a_run_is_told_of_goals_reaches_its_hindsight() -> None:
-    config = dataclasses.replace(TINY, nearness=3.0, goal_distance=0.2, goal_angle=0.4)
-    stamp, draw, paint, reward = make_hindsight(config, lambda pixels, pose, goal_pose: pixels)
+    domain = halgan_envs.domain("pick-and-place-2m")
+    config = changed(TINY, {"method": "oracle", "hindsight.nearness": 3.0})
+    stamp, draw, paint, reward = make_hindsight(config, domain).transforms
     assert (stamp.max_distance, draw.nearness, paint.pursue_unseen) == (32, 3.0, False)
-    assert draw.tolerance == reward.tolerance == PoseTolerance(0.2, 0.4)
+    assert stamp.poses == draw.poses == reward.poses == domain.poses
+    assert domain.poses.flags == ("held",)
 
 
 def test_a_folder_that_holds_a_run_is_refused_first(tmp_path: Path) -> None:
     (tmp_path / "metrics.csv").write_text("precious")
     with pytest.raises(FileExistsError, match="already holds a run"):
-        main(dataclasses.replace(TINY, out=tmp_path))
+        main(changed(TINY, {"out": tmp_path}))
     assert [path.name for path in tmp_path.iterdir()] == ["metrics.csv"]
 
 
 def test_an_unknown_environment_is_refused_before_the_folder_is_made(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"'moon'.*navigate-2m"):
-        main(dataclasses.replace(TINY, environment="moon", hindsight="none", out=tmp_path / "run"))
+        main(changed(TINY, {"environment": "moon", "method": "none", "out": tmp_path / "run"}))
     assert not (tmp_path / "run").exists()
 
 
 def test_an_environment_with_other_actions_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"pebble.*discrete.*ddqn"):
-        main(dataclasses.replace(TINY, environment="pebble", hindsight="none", out=tmp_path / "run"))
+        main(changed(TINY, {"environment": "pebble", "method": "none", "out": tmp_path / "run"}))
     assert not (tmp_path / "run").exists()
 
 
 def test_weights_for_another_room_are_refused_before_the_folder_is_made(tmp_path: Path) -> None:
     other = Path(__file__).parents[2] / "halgan_rl" / "hallucination" / "shipped" / "navigate-4m.safetensors"
     with pytest.raises(ValueError, match=r"navigate-4m.*navigate-2m"):
-        main(dataclasses.replace(TINY, out=tmp_path / "run", weights=other))
+        main(changed(TINY, {"out": tmp_path / "run", "painter.weights": other}))
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("args", [["--no-such-flag", "1"], ["--hindsight", "magic"], ["--preset", "nature"]])
-def test_unknown_flags_and_methods_are_refused(args: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("args", [["--no-such-flag", "1"], ["--agent.tau", "magic"], ["--preset", "nature"]])
+def test_unknown_flags_and_values_are_refused(args: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_:
         parse_config(PRESETS, args, description=None)
     assert exit_.value.code == 2
     assert args[1] in (printed := "".join(capsys.readouterr())) or args[0] in printed
 
 
+def test_an_unknown_method_is_refused_before_the_folder_is_made(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"method='magic' is unknown: choose one of halgan, her, oracle, none"):
+        main(changed(TINY, {"method": "magic", "out": tmp_path / "run"}))
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize(
-    "changes",
-    [{"warmup_frames": 16}, {"batch_size": 0}, {"hallucination_start": 1.5}, {"frames_per_batch": 0}],
-    ids=lambda changes: next(iter(changes)),
+    ("name", "value"),
+    [
+        ("training.warmup_frames", 16),
+        ("training.batch_size", 0),
+        ("training.frames_per_batch", 0),
+        ("evaluation.starts", 0),
+        ("agent.tau", 0.0),
+    ],
 )
-def test_values_that_cannot_work_are_refused(changes: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=next(iter(changes))):
-        dataclasses.replace(Config(), **changes)
+def test_values_that_cannot_work_are_refused(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=name.rpartition(".")[2]):
+        changed(DEFAULT, {name: value})
 
 
 def test_the_preset_chooses_the_defaults_and_flags_win() -> None:
     assert parse_config(PRESETS, [], description=None) == PRESETS["default"]
-    assert not PRESETS["default"].pursue_unseen
+    assert not PRESETS["default"].hindsight.pursue_unseen
     assert parse_config(PRESETS, ["--preset", "paper"], description=None) == PRESETS["paper"]
-    config = parse_config(PRESETS, ["--preset", "paper", "--batch-size", "16"], description=None)
-    assert config == dataclasses.replace(PRESETS["paper"], batch_size=16)
+    config = parse_config(PRESETS, ["--preset", "paper", "--training.batch-size", "16"], description=None)
+    assert config == changed(PRESETS["paper"], {"training.batch_size": 16})
 
 
 def test_the_paper_preset_is_the_papers_table() -> None:
     paper = PRESETS["paper"]
-    assert (paper.replay_capacity, paper.warmup_frames, paper.batch_size, paper.frames_per_update) == (
-        100_000,
-        10_000,
-        32,
-        1,
-    )
-    assert (paper.actor_learning_rate, paper.critic_learning_rate, paper.target_rate) == (1e-5, 1e-4, 1e-3)
-    assert (paper.epsilon_start, paper.epsilon_end, paper.epsilon_frames) == (1.0, 0.5, 100_000)
-    assert (paper.hallucination_start, paper.hallucination_end, paper.max_distance) == (0.3, 0.0, 32)
-    assert (paper.pursue_unseen, paper.nearness) == (True, 1.0)
-    assert (paper.discount, paper.noise, paper.clip_targets) == (0.99, 0.1, False)
+    agent, hindsight, training = paper.agent, paper.hindsight, paper.training
+    assert (training.replay_capacity, training.warmup_frames, training.batch_size) == (100_000, 10_000, 32)
+    assert training.frames_per_update == 1
+    assert (agent.actor_learning_rate, agent.critic_learning_rate, agent.tau) == (1e-5, 1e-4, 1e-3)
+    assert agent.epsilon == Annealing(1.0, 0.5, 100_000)
+    assert (agent.discount, agent.noise, agent.clip_targets, agent.downsample) == (0.99, 0.1, False, "max_pool")
+    assert hindsight.probability == Annealing(0.3, 0.0, 100_000)
+    assert (hindsight.max_distance, hindsight.pursue_unseen, hindsight.nearness) == (32, True, 1.0)
+    assert (paper.painter.bank, paper.painter.share_latent) == (False, False)

@@ -1,16 +1,16 @@
 """The claim of the whole library, on the real environment; about ten minutes. `make test-slow` runs it."""
 
-import dataclasses
 from pathlib import Path
 
 import pytest
 
 from halgan_rl.experiment.run_folder import read_metrics
-from recipes.ddpg_navigate import Config, main
+from recipes.ddpg_navigate import DEFAULT, main
+from tests.recipes import changed
 
 
-def success_rates(out: Path, hindsight: str) -> list[float]:
-    main(dataclasses.replace(Config(), hindsight=hindsight, total_frames=10_000, out=out, film_starts=1))
+def success_rates(out: Path, method: str) -> list[float]:
+    main(changed(DEFAULT, {"method": method, "total_frames": 10_000, "out": out, "evaluation.film_starts": 1}))
     return read_metrics(out / "metrics.csv")["eval/success_rate"]
 
 
