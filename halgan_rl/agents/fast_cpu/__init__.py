@@ -1,1 +1,5 @@
-"""The same agents, computed faster on a CPU."""
+"""The same agents, computed faster on a CPU: :func:`accelerate`."""
+
+from halgan_rl.agents.fast_cpu.acceleration import accelerate
+
+__all__ = ["accelerate"]

@@ -7,11 +7,11 @@ from torchrl.objectives import SoftUpdate
 
 
 class FusedSoftUpdate(SoftUpdate):
-    """TorchRL's SoftUpdate, but that the parameters are not gathered anew at each step; arguments as there."""
+    """TorchRL's SoftUpdate, without gathering the parameters anew at each step; arguments as there."""
 
     @torch.no_grad()
     def step(self) -> None:
-        """Move each target parameter by a fraction tau towards its source."""
+        """Moves each target parameter by a fraction tau towards its source."""
         loss = self.loss_module
         pairs = loss.__dict__.get("_cached_pairs")  # erased by TorchRL, as all that begins so, when parameters move
         if pairs is None:
@@ -19,7 +19,7 @@ class FusedSoftUpdate(SoftUpdate):
         get_ema_multi_avg_fn(self.eps)(*pairs, None)
 
     def _gather(self) -> tuple[list[Tensor], list[Tensor]]:
-        """Return the target parameters and what they follow."""
+        """Returns the target parameters and what they follow."""
         children = dict(self.loss_module.named_children())
         keys = [(name, *path) for name, *path in self._sources.keys(True, True)]
         targets = [children[f"target_{name}"][tuple(path)] for name, *path in keys]

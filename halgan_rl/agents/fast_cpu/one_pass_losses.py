@@ -1,9 +1,14 @@
 """TorchRL's losses of our agents, with as few passes through their convolutions as there can be.
 
-The values and gradients are those of the losses that they derive from, but for rounding. Those ask each network for
-itself, and the critic twice about the same frame; here networks that see the same frames share a pass
-(:func:`halgan_rl.agents.networks.see`), and nothing is asked twice. Networks are kept as modules that hold the loss's own
-parameters: filling one with parameters at each call, as TorchRL does, costs more than all that is not convolution.
+The values and gradients are those of the losses from which they derive, except for rounding. Those run each network by
+itself, and the critic twice on the same frame; here networks that see the same frames share a pass
+(:func:`~halgan_rl.agents.fast_cpu.block_encoder.encode_together`), and nothing is computed twice. Networks are kept as
+modules that hold the loss's own parameters: filling one with parameters at each call, as TorchRL does, costs more than
+all that is not convolution.
+
+A loss becomes one of these in place: see :func:`share_passes`.
+
+Shapes: B is the batch, ``[*B]``, N the product of its dimensions; F are features, A is the action's size.
 """
 
 import copy
@@ -11,15 +16,16 @@ from functools import cached_property
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, dispatch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import dispatch
 from torch import Tensor, nn
 from torch.nn import functional as F
 from torchrl.objectives import DQNLoss, LossModule
 from torchrl.objectives.utils import distance_loss
 
-from halgan_rl.agents.networks import Actor, Critic, QNetwork, deterministic_policy, greedy_policy, see
-from halgan_rl.agents.objectives import UnsaturatedDDPGLoss
+from halgan_rl.agents.ddpg import Actor, Critic, UnsaturatedDDPGLoss
+from halgan_rl.agents.ddqn import QNetwork
+from halgan_rl.agents.fast_cpu.block_encoder import encode_together, fits
 from halgan_rl.keys import next_key
 
 
@@ -27,8 +33,8 @@ class _OnePassLoss(LossModule):
     """A loss whose networks are at hand as modules."""
 
     def _modules_of(self, network: str) -> tuple[Any, Any]:
-        """Return a network and its target network, which hold the loss's parameters themselves."""
-        children = dict(self.named_children())  # asked by name, TorchRL warns that no updater is known yet
+        """Returns a network and its target network, which hold the loss's parameters themselves."""
+        children = dict(self.named_children())  # as attributes, TorchRL warns that no updater is known yet
         module = getattr(self, network)
         return filled(module, children[f"{network}_params"]), filled(module, children[f"target_{network}_params"])
 
@@ -38,14 +44,14 @@ class _OnePassLoss(LossModule):
 
 
 def filled(network: nn.Module, parameters: TensorDictBase) -> Any:
-    """Return a copy of a network that has other parameters: these very tensors, so that it follows their changes."""
+    """Returns a copy of a network that has other parameters: these very tensors, so that it follows their changes."""
     copied = copy.deepcopy(network)
     parameters.to_module(copied)
     return copied
 
 
 def _pass_through(head: nn.Sequential, features: Tensor) -> Tensor:
-    """Return what a head makes of features, with gradients for these only."""
+    """Returns what a head makes of features, with gradients for these only."""
     for layer in head:
         if isinstance(layer, nn.Linear):
             features = F.linear(features, layer.weight.detach(), layer.bias.detach())
@@ -55,46 +61,12 @@ def _pass_through(head: nn.Sequential, features: Tensor) -> Tensor:
 
 
 class OnePassDDPGLoss(_OnePassLoss, UnsaturatedDDPGLoss):
-    """:class:`halgan_rl.agents.objectives.UnsaturatedDDPGLoss` of an actor and a critic, with a target network each.
+    """:class:`~halgan_rl.agents.ddpg.UnsaturatedDDPGLoss` of an actor and a critic, with a target network each.
 
     Both losses share a graph: add them up before ``backward``; neither depends on the other's network. Backward through
     one alone works once (PyTorch's ``retain_graph`` allows more), and then the convolutions of the other network get
     gradients of zero, where TorchRL's loss gives none.
-
-    Args:
-        actor: its parameters are trained where they are.
-        critic: likewise, with the same down-sampling.
-        pixels_key: images uint8 ``[..., 64, 64, 3]``, also below ``"next"``.
-        action_key: actions taken, ``[..., A]``.
-        **kwargs: see :class:`halgan_rl.agents.objectives.UnsaturatedDDPGLoss`.
-
-    Raises:
-        ValueError: with ``separate_losses``, which is for networks that share parameters.
     """
-
-    def __init__(
-        self,
-        actor: Actor,
-        critic: Critic,
-        *,
-        pixels_key: NestedKey = "pixels",
-        action_key: NestedKey = "action",
-        preactivation_key: NestedKey = "preactivation",
-        **kwargs: Any,
-    ) -> None:
-        if kwargs.get("separate_losses"):
-            raise ValueError(
-                "separate_losses=True is for networks that share parameters: use UnsaturatedDDPGLoss for them"
-            )
-        policy = deterministic_policy(
-            actor, pixels_key=pixels_key, preactivation_key=preactivation_key, action_key=action_key
-        )
-        judge = TensorDictModule(critic, in_keys=[pixels_key, action_key], out_keys=["state_action_value"])
-        super().__init__(
-            policy, judge, delay_actor=True, delay_value=True, preactivation_key=preactivation_key, **kwargs
-        )
-        self.pixels_key, self.action_key = pixels_key, action_key
-        _ = self._cached_networks  # now: where the loss is compiled is no place to copy networks
 
     @cached_property  # TorchRL erases what is called _cached... when the parameters move
     def _cached_networks(self) -> tuple[tuple[Actor, Critic], tuple[Actor, Critic]]:
@@ -104,22 +76,30 @@ class OnePassDDPGLoss(_OnePassLoss, UnsaturatedDDPGLoss):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Return the losses and figures of TorchRL's DDPGLoss; write the priorities."""
+        """Returns the losses and metrics of TorchRL's DDPGLoss; writes the priorities."""
         (actor, critic), _ = self._cached_networks
-        target = self._target_value(tensordict)
-        pixels, action = tensordict.get(self.pixels_key), tensordict.get(self.action_key).detach()
+        target = self._target_value(tensordict)  # [*B]
+        pixels_key, action_key = self.value_network.in_keys
+        pixels, action = tensordict.get(pixels_key), tensordict.get(action_key).detach()  # [*B, H, W, C], [*B, A]
         shape = pixels.shape[:-3]
-        actor_features, critic_features = see(pixels, [actor.vision, critic.vision])
-        value = critic.judge(critic_features, action.reshape(-1, action.shape[-1])).reshape(shape)
+
+        # Actor and critic see s in one pass: [*B, H, W, C] -> [N, F] each.
+        actor_features, critic_features = encode_together(pixels, [actor.encoder, critic.encoder])
+
+        # The value of the action that was taken: [N, F] and [N, A] -> [N, 1] -> [*B].
+        unit_action = critic.scale.to_unit(action).reshape(-1, action.shape[-1])
+        value = critic.judge(critic_features, unit_action).reshape(shape)
+
+        # The value of the actor's own action, [N, F] -> [N, A] -> [N], with gradients for the actor only.
         preactivation = actor.head(actor_features)
         joined = torch.cat([critic_features.detach(), preactivation.tanh()], -1)
         reached = _pass_through(critic.head, joined).squeeze(-1)
-        price = self.preactivation_weight * preactivation.square().mean(-1)
+        penalty = self.preactivation_weight * preactivation.square().mean(-1)
 
         td_error = (value - target).square().detach()
         tensordict.set(self.tensor_keys.priority, td_error, inplace=True)
         losses = {
-            "loss_actor": (price - reached).reshape(shape),
+            "loss_actor": (penalty - reached).reshape(shape),
             "loss_value": distance_loss(value, target, loss_function=self.loss_function),
         }
         weights = self._maybe_get_priority_weight(tensordict)
@@ -140,31 +120,18 @@ class OnePassDDPGLoss(_OnePassLoss, UnsaturatedDDPGLoss):
 
     @torch.no_grad()
     def _target_value(self, tensordict: TensorDictBase) -> Tensor:
+        """Returns the targets ``[*B]`` of the values."""
         _, (actor, critic) = self._cached_networks
-        pixels = tensordict.get(next_key(self.pixels_key))
-        actor_features, critic_features = see(pixels, [actor.vision, critic.vision])
+        pixels = tensordict.get(next_key(self.value_network.in_keys[0]))
+
+        # The target networks see s' in one pass, and the critic values the actor's action there: [*B, 1].
+        actor_features, critic_features = encode_together(pixels, [actor.encoder, critic.encoder])
         value = critic.judge(critic_features, actor.head(actor_features).tanh()).reshape(*pixels.shape[:-3], 1)
         return self.value_estimator.value_estimate(tensordict, next_value=value).squeeze(-1)
 
 
 class OnePassDQNLoss(_OnePassLoss, DQNLoss):
-    """TorchRL's DQNLoss of a network of action values, with one-hot actions and a target network.
-
-    Args:
-        network: its parameters are trained where they are.
-        double: whether the network itself chooses the action that the target network values (van Hasselt et al., "Deep
-            Reinforcement Learning with Double Q-learning", 2016).
-        pixels_key: images uint8 ``[..., 64, 64, 3]``, also below ``"next"``.
-        **kwargs: see :class:`~torchrl.objectives.DQNLoss`.
-    """
-
-    def __init__(
-        self, network: QNetwork, *, double: bool = True, pixels_key: NestedKey = "pixels", **kwargs: Any
-    ) -> None:
-        policy = greedy_policy(network, pixels_key=pixels_key)
-        super().__init__(policy, delay_value=True, double_dqn=double, action_space="one_hot", **kwargs)
-        self.pixels_key = pixels_key
-        _ = self._cached_networks  # now: where the loss is compiled is no place to copy networks
+    """TorchRL's DQNLoss of a network of action values, with one-hot actions and a target network."""
 
     @cached_property
     def _cached_networks(self) -> tuple[QNetwork, QNetwork]:
@@ -173,10 +140,15 @@ class OnePassDQNLoss(_OnePassLoss, DQNLoss):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Return the loss of TorchRL's DQNLoss; write the priorities."""
-        target = self._target_value(tensordict)
-        values = self._cached_networks[0](tensordict.get(self.pixels_key))
+        """Returns the loss of TorchRL's DQNLoss; writes the priorities."""
+        target = self._target_value(tensordict)  # [*B]
+        network, pixels = self._cached_networks[0], tensordict.get(self.value_network.in_keys[0])
+
+        # The values of all actions at s, and that of the action that was taken: [*B, A] -> [*B].
+        (features,) = encode_together(pixels, [network.encoder])
+        values = network.head(features).reshape(*pixels.shape[:-3], -1)
         value = (values * tensordict.get(self.tensor_keys.action).to(values.dtype)).sum(-1)
+
         error = (value - target).square().detach()
         tensordict.set(self.tensor_keys.priority, error.unsqueeze(-1), inplace=True)
         loss = distance_loss(value, target, self.loss_function)
@@ -185,11 +157,49 @@ class OnePassDQNLoss(_OnePassLoss, DQNLoss):
 
     @torch.no_grad()
     def _target_value(self, tensordict: TensorDictBase) -> Tensor:
-        pixels = tensordict.get(next_key(self.pixels_key))
+        """Returns the targets ``[*B]`` of the values."""
+        pixels = tensordict.get(next_key(self.value_network.in_keys[0]))
+
+        # The target network and, if double, the network itself see s' in one pass: [*B, H, W, C] -> [N, A] each.
         online, target = self._cached_networks
         networks = [target, online] if self.double_dqn else [target]
-        features = see(pixels, [network.vision for network in networks])
+        features = encode_together(pixels, [network.encoder for network in networks])
         valued, *chosen = (network.head(seen) for network, seen in zip(networks, features, strict=True))
+
+        # The first best action of the one, valued by the other: [N, A] -> [N, 1] -> [*B, 1].
         best = (chosen[0] if chosen else valued).argmax(-1, keepdim=True)
         value = valued.gather(-1, best).reshape(*pixels.shape[:-3], 1)
         return self.value_estimator.value_estimate(tensordict, next_value=value).squeeze(-1)
+
+
+def share_passes(loss: LossModule) -> bool:
+    """Makes a loss of our agents share passes, in place: the same parameters and targets, another ``forward``.
+
+    Returns:
+        Whether it does: the loss is TorchRL's with our networks and their usual layers, on a CPU.
+    """
+    if isinstance(loss, _OnePassLoss):
+        return True
+    if not next(loss.parameters()).is_cpu:
+        return False
+    if type(loss) is UnsaturatedDDPGLoss:
+        networks, wanted, fast = (
+            [loss.actor_network[0].module, loss.value_network.module],
+            [Actor, Critic],
+            OnePassDDPGLoss,
+        )
+    elif type(loss) is DQNLoss and loss.delay_value and loss.action_space == "one_hot":
+        networks, wanted, fast = [loss.value_network[0].module], [QNetwork], OnePassDQNLoss
+    else:
+        return False
+    if [type(network) for network in networks] != wanted or not all(_is_usual(network) for network in networks):
+        return False
+    loss.__class__ = fast
+    _ = loss._cached_networks  # now: where the loss is compiled is no place to copy networks
+    return True
+
+
+def _is_usual(network: nn.Module) -> bool:
+    """Whether the encoder fits, and all that learns in the head are linear layers: see :func:`_pass_through`."""
+    learning = [layer for layer in network.head if next(layer.parameters(), None) is not None]
+    return fits(network.encoder) and all(type(layer) is nn.Linear for layer in learning)

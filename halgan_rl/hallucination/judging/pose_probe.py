@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from halgan_rl.agents.networks import Vision
+from halgan_rl.agents.encoder import Encoder
 from halgan_rl.poses import relative_pose
 
 
@@ -16,13 +16,13 @@ class PoseProbe(nn.Module):
 
     def __init__(self, width: int = 64) -> None:
         super().__init__()
-        self.vision = Vision()
+        self.encoder = Encoder()
         self.head = nn.Sequential(nn.LazyLinear(width), nn.LeakyReLU(0.1), nn.Linear(width, 2))
         self(torch.zeros(1, 64, 64, 3, dtype=torch.uint8))  # settles the lazy layer
 
     def forward(self, pixels: Tensor) -> Tensor:
         """Return bearing [rad, positive is left] and distance [m], ``[N, 2]``, for uint8 ``[N, 64, 64, 3]``."""
-        bearing, log_distance = self.head(self.vision(pixels)).unbind(-1)
+        bearing, log_distance = self.head(self.encoder(pixels)).unbind(-1)
         return torch.stack([bearing, log_distance.exp()], -1)
 
 
