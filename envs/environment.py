@@ -1,4 +1,4 @@
-"""A composer environment that is compiled once, starts where it is asked to, and closes its cameras."""
+"""A composer environment that is compiled once, starts where a caller fixes it, and closes its cameras."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -33,8 +33,50 @@ class Environment(composer.Environment):
         self._action_spec = task.action_spec(self.physics)
 
     def action_spec(self) -> Any:
-        """Of the task, made once."""
+        """Returns that of the task, made once."""
         return self._action_spec
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether :meth:`close` has freed the physics."""
+        return self._physics is None
+
+    @property
+    def physics(self) -> Any:
+        """A proxy of the physics, which must not outlive the environment.
+
+        Raises:
+            RuntimeError: after :meth:`close`.
+        """
+        self._check_open()
+        return super().physics
+
+    def reset(self) -> Any:
+        """Starts an episode.
+
+        Returns:
+            The first ``dm_env.TimeStep``.
+
+        Raises:
+            RuntimeError: after :meth:`close`.
+        """
+        self._check_open()
+        return super().reset()
+
+    def step(self, action: Any) -> Any:
+        """Takes an action for one step.
+
+        Args:
+            action: As ``action_spec`` says; not checked.
+
+        Returns:
+            The next ``dm_env.TimeStep``; the first of an episode if there was none or the last one was over.
+
+        Raises:
+            RuntimeError: after :meth:`close`.
+        """
+        self._check_open()
+        return super().step(action)
 
     def reset_to(self, start: Mapping[str, Any]) -> Any:
         """Starts an episode from a fixed start; later episodes are drawn again.
@@ -47,7 +89,9 @@ class Environment(composer.Environment):
 
         Raises:
             ValueError: if the start is impossible; the episode before goes on.
+            RuntimeError: after :meth:`close`.
         """
+        self._check_open()
         self.task.fix_start(start)
         try:
             return self.reset()
@@ -55,11 +99,20 @@ class Environment(composer.Environment):
             self.task.fix_start({})
 
     def render_overview(self, height: int = 240, width: int = 320) -> np.ndarray:
-        """Renders the room from outside, for people: uint8 [height, width, 3], anti-aliased."""
+        """Renders the room from outside, for people: uint8 [height, width, 3], anti-aliased.
+
+        Raises:
+            RuntimeError: after :meth:`close`.
+        """
+        self._check_open()
         if self._overview is None or self._overview.shape != (height, width):
             self._close_overview()
             self._overview = PersistentCamera(self.physics, "overview", height=height, width=width, samples=4)
         return self._overview.render(self.physics)
+
+    def _check_open(self) -> None:
+        if self.is_closed:
+            raise RuntimeError("This environment is closed: make a new one to reset, step or render.")
 
     def _close_overview(self) -> None:
         if self._overview is not None:
@@ -69,6 +122,6 @@ class Environment(composer.Environment):
     def close(self) -> None:
         """Frees cameras and physics; harmless when repeated."""
         self._close_overview()
-        if self._physics is not None:
+        if not self.is_closed:
             self.task.robot.close()
             super().close()

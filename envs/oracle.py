@@ -50,7 +50,9 @@ class GoalRenderer:
 
         Raises:
             ValueError: if a pose is not finite or lacks entries.
+            RuntimeError: after :meth:`close`.
         """
+        self._check_open()
         _check_size(pose.shape[-1], self._task.flags)
         _check_size(goal_pose.shape[-1])
         leading = pixels.shape[:-3]
@@ -87,7 +89,9 @@ class GoalRenderer:
 
         Raises:
             ValueError: if the pose is not finite or lacks entries.
+            RuntimeError: after :meth:`close`.
         """
+        self._check_open()
         _check_size(len(pose), self._task.flags)
         if not np.isfinite(pose).all():
             raise ValueError(f"Cannot render from pose {np.asarray(pose).tolist()}: its entries must be finite.")
@@ -100,8 +104,12 @@ class GoalRenderer:
         """Renders the robot's camera at pose [P] in a room without goals."""
         return self.render(pose)
 
+    def _check_open(self) -> None:
+        if self.environment.is_closed:
+            raise RuntimeError("This goal renderer is closed: make a new halgan_envs.GoalRenderer to render again.")
+
     def close(self) -> None:
-        """Frees camera and physics."""
+        """Frees camera and physics; harmless when repeated."""
         self.environment.close()
 
 

@@ -57,6 +57,7 @@ class GymnasiumEnv(gymnasium.Env[dict[str, Any], Any]):
 
         Raises:
             ValueError: if the options are unknown or impossible; nothing is reset then.
+            RuntimeError: after :meth:`close`.
         """
         super().reset(seed=seed)
         if seed is not None:
@@ -72,7 +73,7 @@ class GymnasiumEnv(gymnasium.Env[dict[str, Any], Any]):
 
         Raises:
             ValueError: if the action is not in the action space.
-            RuntimeError: if the episode is over.
+            RuntimeError: if the episode is over, or after :meth:`close`.
         """
         transition = advance(self.environment, np.asarray(action))
         return (
@@ -84,11 +85,11 @@ class GymnasiumEnv(gymnasium.Env[dict[str, Any], Any]):
         )
 
     def render(self) -> np.ndarray | None:
-        """The room from outside, uint8 [240, 320, 3]; None without a render mode."""
+        """Returns the room from outside, uint8 [240, 320, 3]; None without a render mode."""
         return None if self.render_mode is None else self.environment.render_overview()
 
     def close(self) -> None:
-        """Frees cameras and physics; harmless when repeated."""
+        """Frees cameras and physics; a reset, a step or a picture then raises a ``RuntimeError``."""
         self.environment.close()
 
 

@@ -77,11 +77,15 @@ class ComposerEnv(EnvBase):
         self.environment.random_state.seed(seed)
 
     def render_overview(self, height: int = 240, width: int = 320) -> np.ndarray:
-        """Renders the room from outside, for people: uint8 [height, width, 3], anti-aliased."""
+        """Renders the room from outside, for people: uint8 [height, width, 3], anti-aliased.
+
+        Raises:
+            RuntimeError: after :meth:`close`.
+        """
         return self.environment.render_overview(height, width)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Frees cameras and physics."""
+        """Frees cameras and physics; a reset, a step or a picture then raises a ``RuntimeError``."""
         super().close(raise_if_closed=raise_if_closed)
         self.environment.close()
 

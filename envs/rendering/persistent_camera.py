@@ -63,12 +63,12 @@ class PersistentCamera:
             A fresh array, uint8 [height, width, 3].
 
         Raises:
-            RuntimeError: after :meth:`close`.
+            RuntimeError: after :meth:`close`, or after that of the environment.
         """
         if self._context is None:
             raise RuntimeError("This camera is closed: make a new environment to render again.")
         mujoco.mjv_updateScene(
-            self._model, physics.data.ptr, self.options, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
+            self._model, _data(physics), self.options, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene
         )
         with self._gl.make_current() as thread:
             thread.call(self._draw)
@@ -84,6 +84,13 @@ class PersistentCamera:
         if self._context is not None:
             self._context.free()
         self._context = None
+
+
+def _data(physics: Any) -> mujoco.MjData:
+    try:
+        return physics.data.ptr
+    except ReferenceError as error:
+        raise RuntimeError("The environment of this camera is closed: make a new one to render again.") from error
 
 
 def _fixed_camera(model: mujoco.MjModel, name: str) -> mujoco.MjvCamera:

@@ -47,7 +47,6 @@ class SightedRobot(composer.Entity):
         return self.camera
 
     def close(self) -> None:
-        """Closes the camera."""
+        """Closes the camera, which then refuses to render."""
         if self.camera is not None:
             self.camera.close()
-        self.camera = None
