@@ -2,26 +2,24 @@
 
 import logging
 from collections.abc import Sequence
-from functools import partial, reduce
 from multiprocessing.context import get_spawning_popen
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
-import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.data import LazyTensorStorage
 
-from halgan_rl.keys import dotted, next_key
+from halgan_rl.keys import Keys, dotted
 from halgan_rl.replay.frame_checkpointer import FrameStorageCheckpointer
+from halgan_rl.replay.frame_columns import make_columns, select
 from halgan_rl.replay.frame_table import OVERHEAD, FrameTable, FrameTableFullError, gather
 from halgan_rl.replay.free_room import check_room, readable
+from halgan_rl.replay.refused_write import call_transforms, undo_write
+from halgan_rl.replay.row_memory import allocate, map_files
 
 _LOGGER = logging.getLogger(__name__)
-
-_MEMORY = torch.device("cpu")
 
 CHUNK = 1_024
 """Rows of a checkpoint that are restored at a time."""
@@ -34,11 +32,11 @@ class FrameStorage(LazyTensorStorage):
     """A TorchRL storage in which each frame is kept once, though two rows show it.
 
     What one row sees after its action is, within an episode, what the next row sees before its own. TorchRL's storages
-    keep both. Here a row holds the *numbers* of its two frames in a :class:`~halgan_rl.replay.frame_table.FrameTable`, which
-    keeps equal frames once; TorchRL stores its other entries as ever. Frames are told apart by their bytes, never by
-    the rows' positions, so what is read is what was written, bit for bit: in whatever order rows are written, with
-    several environments interleaved, across the ends of episodes and the ring's wrap. A frame is released with the
-    last row that shows it.
+    keep both. Here a row holds the *numbers* of its two frames in a
+    :class:`~halgan_rl.replay.frame_table.FrameTable`, which keeps equal frames once; TorchRL stores its other
+    entries as ever. Frames are told apart by their bytes, never by the rows' positions, so what is read is what was
+    written, bit for bit: in whatever order rows are written, with several environments interleaved, across the ends of
+    episodes and the ring's wrap. A frame is released with the last row that shows it.
 
     There is room for a frame a row, and for ``extra_frames`` more: those that no row shows before its action, which are
     the last of each episode and the newest of each environment. Their memory is touched only when they are needed.
@@ -61,7 +59,8 @@ class FrameStorage(LazyTensorStorage):
         scratch_dir: Folder on whose disk rows and frames are mapped; None keeps them in memory.
         extra_frames: Frames beyond one a row; by default a tenth of ``max_size`` or 64, whichever is more: enough
             for episodes that on average are longer than ten steps. As many as ``max_size`` are always enough.
-        pixels_key: Frame, of any shape, uint8. Read at the root and under ``"next"``.
+        keys: Where rows keep their frames, of any shape, uint8, at the root and under ``"next"``; only ``keys.pixels``
+            is read.
 
     Attributes:
         bytes_per_row: Size of a row [bytes]: a frame, the other entries, the bookkeeping.
@@ -76,7 +75,11 @@ class FrameStorage(LazyTensorStorage):
         RuntimeError: On writing, if frames exceed ``extra_frames``; on reading, if nothing has been written.
         IndexError: On writing beyond ``max_size``; on reading a row that was never written.
 
-    A batch that is refused is refused whole, and the storage stays as it was.
+    A batch that is refused is refused whole, and all stays as it was: the storage, the cursor of the buffer's writer
+    (TorchRL's default ones), and the rows that a transform held back, if it has a method ``undo_write()``, as
+    ``StampFuturePoses`` does. ``replay_buffer.empty()`` also drops the rows held back, by a method
+    ``drop_held_rows()``. (A ``TensorDictMaxValueWriter`` ranks rows before it writes them, and keeps the ranks of those
+    refused.)
 
     Examples:
         >>> from torchrl.data import TensorDictReplayBuffer
@@ -98,7 +101,7 @@ class FrameStorage(LazyTensorStorage):
         *,
         scratch_dir: str | Path | None = None,
         extra_frames: int | None = None,
-        pixels_key: NestedKey = "pixels",
+        keys: Keys = Keys(),
     ) -> None:
         if max_size < 1:
             raise ValueError(f"max_size must be at least 1 row, got {max_size}")
@@ -108,10 +111,9 @@ class FrameStorage(LazyTensorStorage):
         self.device = None  # All is in CPU memory: a buffer would only spend a quarter of a sample's time on moving it.
         self.scratch_dir = None if scratch_dir is None else Path(scratch_dir)
         self.extra_frames = min(max(max_size // 10, 64), max_size) if extra_frames is None else extra_frames
-        self.pixels_key = pixels_key
         self.bytes_per_row = 0
         self.nbytes = 0
-        self._keys = (unravel_key(pixels_key), unravel_key(next_key(pixels_key)))
+        self._keys = (unravel_key(keys.pixels), keys.next("pixels"))
         self._table: FrameTable
         self._frame_shape: torch.Size
 
@@ -128,18 +130,16 @@ class FrameStorage(LazyTensorStorage):
             data: Rows ``[N]``, or ``[]`` if ``cursor`` is a number.
             set_cursor: Whether the length grows so as to include the rows; a buffer's writer wants that.
         """
-        places, rows = self._read_rows(cursor, data)
+        was_initialized = self.initialized
+        try:
+            places = self._write(cursor, data)
+        except Exception:
+            if not was_initialized:
+                self._free()
+            undo_write(self._attached_entities, cursor, writer_moved=set_cursor)
+            raise
         if not places:
             return
-        frames = self._read_frames(rows)
-        if not self.initialized:
-            self._allocate(rows[0].exclude(*self._keys).to("cpu"), frames[0].shape[1:])
-        entries = self._read_entries(rows)
-        self._check_fit(entries, frames[0].shape[1:])
-        index = torch.tensor(places, dtype=torch.int64)
-        self._slots.index_copy_(1, index, self._exchange(frames, index))
-        for key, value in entries.items():
-            self._entries[key].index_copy_(0, index, value)
         if set_cursor:
             self._set_last_cursor(cursor)
             self._len = max(len(self), max(places) + 1)
@@ -151,12 +151,12 @@ class FrameStorage(LazyTensorStorage):
             raise RuntimeError("FrameStorage holds no rows yet: write some before reading any")
         if isinstance(index, Tensor) and index.ndim == 1 and index.dtype == torch.int64:  # as samplers draw it
             try:
-                return _select(self._columns, index)
+                return select(self._columns, index)
             except IndexError:  # counted from the end, or never written: told apart below
                 pass
         stored = self._storage[: len(self)]
         rows = stored[index]
-        if _share_memory(rows.get(self.pixels_key), stored.get(self.pixels_key)):
+        if _share_memory(rows.get(self._keys[0]), stored.get(self._keys[0])):
             rows = rows.clone()
         return self._put_frames(rows, self._table.frames, self._frame_shape)
 
@@ -174,9 +174,9 @@ class FrameStorage(LazyTensorStorage):
             ValueError: if the state is no FrameStorage's, is damaged, or does not fit; the rows stay as they were.
         """
         if not state_dict:
-            return self._empty()
+            return self._forget_rows()
         rows, frames = self._read_state(state_dict)
-        self._empty()
+        self._forget_rows()
         for places in torch.arange(len(rows)).split(CHUNK):
             part = self._put_frames(rows[places], frames.flatten(1), frames.shape[1:])
             self.set(places, part, set_cursor=False)
@@ -184,12 +184,33 @@ class FrameStorage(LazyTensorStorage):
         return None
 
     def _empty(self) -> None:
-        """Forgets all rows; the memory stays allocated."""
+        """Forgets all rows, those that transforms hold back too; the memory stays allocated."""
+        self._forget_rows()
+        for buffer in self._attached_entities:
+            call_transforms(buffer, "drop_held_rows")
+
+    def _forget_rows(self) -> None:
         self._len = 0
         if self.initialized:
             self._table.clear()
             self._slots.fill_(-1)
         self._bump_mutation_revision()
+
+    def _write(self, cursor: Places, data: TensorDictBase | list[TensorDictBase]) -> list[int]:
+        """Writes rows, or raises and changes no row. Returns their places."""
+        places, rows = self._read_rows(cursor, data)
+        if not places:
+            return places
+        frames = self._read_frames(rows)
+        if not self.initialized:
+            self._allocate(rows[0].exclude(*self._keys).to("cpu"), frames[0].shape[1:])
+        entries = self._read_entries(rows)
+        self._check_fit(entries, frames[0].shape[1:])
+        index = torch.tensor(places, dtype=torch.int64)
+        self._slots.index_copy_(1, index, self._exchange(frames, index))
+        for key, value in entries.items():
+            self._entries[key].index_copy_(0, index, value)
+        return places
 
     def _read_rows(
         self, cursor: Places, data: TensorDictBase | list[TensorDictBase]
@@ -208,7 +229,7 @@ class FrameStorage(LazyTensorStorage):
         if places.shape != rows.batch_size:
             raise ValueError(
                 f"FrameStorage got rows of batch size {tuple(rows.batch_size)} for places {tuple(places.shape)}: write "
-                "rows [N], such as replay_buffer.extend(rows.reshape(-1))"
+                "rows [N], such as replay_buffer.extend(rows.reshape(-1)), not by add()"
             )
         last: dict[int, int] = {}
         for position, place in enumerate(places.tolist()):
@@ -226,8 +247,8 @@ class FrameStorage(LazyTensorStorage):
             value = rows.get(key, None)
             if value is None:
                 raise KeyError(
-                    f"FrameStorage misses the key {dotted(key)}, set by the constructor argument "
-                    f"pixels_key={self.pixels_key!r}. The rows hold {_names(rows.keys(True, True))}."
+                    f"FrameStorage misses the key {dotted(key)}, set by keys=Keys(pixels={self._keys[0]!r}). The rows "
+                    f"hold {_names(rows.keys(True, True))}."
                 )
             if value.dtype != torch.uint8:
                 raise ValueError(
@@ -265,44 +286,27 @@ class FrameStorage(LazyTensorStorage):
         _LOGGER.info("FrameStorage takes %s: %s", readable(nbytes), remedy)
         check_room(nbytes, slots * OVERHEAD, self.scratch_dir, remedy)
         if self.scratch_dir is None:
-            # NumPy asks the system for huge pages: random reads are a tenth faster than from PyTorch's memory, though
-            # the first writing is slower.
-            frames = torch.from_numpy(np.empty((slots, size), dtype=np.uint8))
-            empty = partial(torch.empty_like, memory_format=torch.contiguous_format)
-            self._storage = row.expand(self.max_size).apply(empty)
-            self._slots = torch.empty(2, self.max_size, dtype=torch.int64)
+            self._storage, self._slots, frames = allocate(row, self.max_size, slots, size)
         else:
-            self._storage, self._slots, frames = self._map(row, slots, size, self.scratch_dir)
-        self._slots.fill_(-1)
+            self._storage, self._slots, frames = map_files(row, self.max_size, slots, size, self.scratch_dir)
         self.initialized = True
         self.bytes_per_row, self.nbytes = bytes_per_row, nbytes
         self._frame_shape, self._table = shape, FrameTable(frames)
         self._set_views()
+
+    def _free(self) -> None:
+        """Gives the memory back, so that the next rows may have other entries."""
+        self.initialized = False
+        self.bytes_per_row = self.nbytes = 0
+        for name in ("_storage", "_slots", "_table", "_entries", "_columns"):
+            self.__dict__.pop(name, None)
 
     def _set_views(self) -> None:
         """Sets what rows are written into, ``_entries``, and read from, ``_columns``: views of the same memory."""
         self._entries = self._read_entries(self._storage)
         for key, numbers in zip(self._keys, self._slots, strict=True):
             self._storage.set(key, numbers)
-        self._columns = self._make_columns()
-
-    def _make_columns(self) -> dict[str, Any]:
-        """Returns the storage's columns, nested like its keys; those of frames give frames instead of their slots."""
-        columns = self._storage.to_dict()
-        frames = self._table.frames.unflatten(1, self._frame_shape)
-        for key in self._keys:
-            *path, name = key if isinstance(key, tuple) else (key,)
-            parent = reduce(dict.__getitem__, path, columns)
-            parent[name] = _FrameColumn(parent[name], frames)
-        return columns
-
-    def _map(self, row: TensorDictBase, slots: int, size: int, folder: Path) -> tuple[TensorDictBase, Tensor, Tensor]:
-        """Maps rows, their slots, frames ``[slots, size]`` to files that are gone when this returns: content stays."""
-        with TemporaryDirectory(dir=folder, prefix="frame_storage-") as temporary:
-            rows = row.expand(self.max_size).memmap_like(Path(temporary, "rows"))
-            frames = torch.from_file(str(Path(temporary, "frames")), True, slots * size, dtype=torch.uint8)
-            numbers = torch.from_file(str(Path(temporary, "slots")), True, 2 * self.max_size, dtype=torch.int64)
-        return rows.apply(_as_tensor), numbers.view(2, -1), frames.view(slots, size)
+        self._columns = make_columns(self._storage, self._keys, self._table.frames.unflatten(1, self._frame_shape))
 
     def _check_fit(self, entries: dict[NestedKey, Tensor], shape: torch.Size) -> None:
         """Refuses rows ``[N]`` with other entries or frames than those stored."""
@@ -379,31 +383,6 @@ class FrameStorage(LazyTensorStorage):
         super().__setstate__(state)
         if self.initialized:
             self._set_views()  # those of a copy are of its own memory
-
-
-class _FrameColumn:
-    """A column of slots that reads as one of frames ``[slots, ...]``."""
-
-    def __init__(self, slots: Tensor, frames: Tensor) -> None:
-        self.slots, self.frames = slots, frames
-
-    def index_select(self, dim: int, index: Tensor) -> Tensor:
-        """Returns copies of the frames of some rows."""
-        return self.frames.index_select(dim, self.slots.index_select(dim, index))
-
-
-def _select(columns: dict[str, Any], index: Tensor) -> TensorDict:
-    """Returns copies of rows ``[N]``, several times as fast as indexing the TensorDict: every update waits for it."""
-    rows = {
-        name: _select(column, index) if type(column) is dict else column.index_select(0, index)
-        for name, column in columns.items()
-    }
-    return TensorDict._new_unsafe(rows, batch_size=index.shape, device=_MEMORY)
-
-
-def _as_tensor(mapped: Tensor) -> Tensor:
-    """The same memory without tensordict's subclass, whose file is gone and which is slow to index."""
-    return mapped.as_subclass(Tensor)
 
 
 def _share_memory(one: Tensor, other: Tensor) -> bool:

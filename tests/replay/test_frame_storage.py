@@ -25,6 +25,7 @@ from torchrl.data import (
 )
 from torchrl.data.replay_buffers import RandomSampler, SamplerWithoutReplacement, SliceSampler
 
+from halgan_rl.keys import Keys
 from halgan_rl.replay import frame_checkpointer, frame_storage, free_room
 from halgan_rl.replay.frame_storage import FrameStorage
 from halgan_rl.replay.frame_table import OVERHEAD
@@ -369,7 +370,7 @@ def test_pixels_may_be_nested() -> None:
     rows = (
         episode(5).rename_key_("pixels", ("camera", "rgb")).rename_key_(("next", "pixels"), ("next", "camera", "rgb"))
     )
-    storage = FrameStorage(5, pixels_key=("camera", "rgb"))
+    storage = FrameStorage(5, keys=Keys(pixels=("camera", "rgb")))
     storage.set(range(5), rows)
     assert_identical(storage[:], rows)
     assert storage.frames_kept == 6
@@ -653,7 +654,11 @@ def with_entry(key: object, value: Tensor) -> TensorDict:
 @pytest.mark.parametrize(
     ("rows", "error", "message"),
     [
-        (episode(4).exclude("pixels"), KeyError, "misses the key pixels, set by .* pixels_key='pixels'.*next.pixels"),
+        (
+            episode(4).exclude("pixels"),
+            KeyError,
+            r"misses the key pixels, set by keys=Keys\(pixels='pixels'\).*next.pixels",
+        ),
         (episode(4).exclude(("next", "pixels")), KeyError, "misses the key next.pixels"),
         (episode(4).exclude("action"), KeyError, "have nothing and lack action"),
         (with_entry("extra", torch.zeros(4)), KeyError, "have extra and lack nothing"),
