@@ -7,26 +7,7 @@ from typing import Literal
 from halgan_rl.agents.agent import AgentConfig
 from halgan_rl.agents.ddpg import DDPGConfig
 from halgan_rl.training.loop import TrainingConfig
-from halgan_rl.transforms.annealing import Annealing
-
-
-@dataclass(frozen=True)
-class HindsightConfig:
-    """Which rows are relabelled, and to which goals."""
-
-    probability: Annealing = Annealing(0.3, 0.0, 60_000)
-    """Fraction of the sampled rows for which a goal is drawn."""
-    max_distance: int = 96
-    """Longest failed segment: the goal lies 1 to this many steps ahead."""
-    nearness: float = 2.0
-    """Preference for near goals: the steps to the goal are uniform to this power; 1 is uniform."""
-    pursue_unseen: bool = True
-    """Also pursue goals that the image does not show."""
-
-    def __post_init__(self) -> None:
-        """Refuses values that would fail only later."""
-        if self.max_distance < 1:
-            raise ValueError(f"max_distance must be at least 1 step, got {self.max_distance}")
+from halgan_rl.transforms import HindsightConfig
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ class ReplayTransform(Transform):
     """A transform of sampled rows: write :meth:`_edit_rows` and every property below holds.
 
     It refuses environments, records no gradients and never modifies the storage; an entry that is missing is reported
-    with the field of ``keys`` that named its key.
+    with the field of ``keys`` that named its key. Rows that it could not edit are refused when they are written, before
+    they reach the storage: see :meth:`_check_written`.
 
     Args:
         keys: where the rows keep what.
@@ -33,6 +34,19 @@ class ReplayTransform(Transform):
         """Sets new entries on ``tensordict``, a shallow copy of the rows; writes into no tensor."""
         raise NotImplementedError(f"{type(self).__name__} must define _edit_rows.")
 
+    @torch.no_grad()
+    def _inv_call(self, tensordict: TensorDictBase | None) -> TensorDictBase | None:
+        """Checks new rows ``[...]``, and returns them as they are."""
+        if tensordict is not None:
+            self._check_written(tensordict)
+        return tensordict
+
+    def _check_written(self, rows: TensorDictBase) -> None:
+        """Raises an error that says what to mend if new rows ``[...]`` could not be edited once they are sampled.
+
+        Called at each write, so it looks at shapes and dtypes only.
+        """
+
     def set_container(self, container: Transform | EnvBase) -> None:
         """Attaches to a ``Compose``.
 
@@ -46,7 +60,7 @@ class ReplayTransform(Transform):
                 "Append it to a replay buffer instead: replay_buffer.append_transform(transform)."
             )
 
-    def _read(self, tensordict: TensorDictBase, name: str, key: NestedKey | None = None) -> Tensor:
+    def _read(self, tensordict: TensorDictBase, name: str, key: NestedKey | None = None, remedy: str = "") -> Tensor:
         """Returns the entry at the key of the field ``name`` of ``keys``, or at ``key``, which derives from it."""
         key = getattr(self.keys, name) if key is None else key
         value = tensordict.get(key, None)
@@ -54,7 +68,7 @@ class ReplayTransform(Transform):
             present = ", ".join(sorted(map(dotted, tensordict.keys(True, True))))
             raise KeyError(
                 f"{type(self).__name__} misses the key {dotted(key)}, set by "
-                f"keys=Keys({name}={getattr(self.keys, name)!r}). The rows hold {present}."
+                f"keys=Keys({name}={getattr(self.keys, name)!r}). The rows hold {present}.{remedy}"
             )
         return value
 

@@ -11,6 +11,12 @@ from halgan_rl.poses import PlanarPoses, Poses
 from halgan_rl.transforms.annealing import Annealing
 from halgan_rl.transforms.base import ReplayTransform
 
+INIT_KEY = "is_init"
+"""Where TorchRL's ``InitTracker`` and recurrent modules keep whether a sequence starts at a row."""
+
+MANY = 8
+"""As many neighbours in a batch are seldom neighbours in the storage, unless a sampler puts them there."""
+
 
 class DrawHindsightGoal(ReplayTransform):
     """Draws, for each sampled row, whether it is relabelled and which later pose of its episode becomes its goal.
@@ -20,7 +26,16 @@ class DrawHindsightGoal(ReplayTransform):
     drawn.
 
     The probability is annealed linearly, as in :class:`torchrl.modules.EGreedyModule`: call :meth:`step` with the
-    number of frames collected. It and the generator's state are part of ``state_dict()``.
+    number of frames collected. The frames and the state of ``rng`` are part of ``state_dict()``.
+
+    **Slices.** A sampler of slices gives consecutive rows, for learners of sequences. With ``per_slice=True``
+    consecutive rows share one decision and one goal, those drawn for the first of them: so all frames show the same
+    goal. A slice is relabelled up to the row that reaches its goal, which terminates there; the rows behind that one
+    keep their own images and rewards. ``"is_init"``, if rows have it, becomes True in the first row of a slice and in
+    the first row behind a goal, for a learner of sequences starts anew there. Slices may have any lengths: one begins
+    where a row is not what follows the row before it. TorchRL's sampler writes flags of its own after the transforms
+    ran, so it must be ``SliceSampler(..., truncated_key=None, init_key=None)``; reshape batches to ``[S, L]`` for
+    returns that look along the time. Without ``per_slice``, slices are refused.
 
     Args:
         probability: Fraction of rows to relabel, in [0, 1], by the frames that :meth:`step` has counted.
@@ -31,12 +46,14 @@ class DrawHindsightGoal(ReplayTransform):
         nearness: Preference k >= 1 for near goals: d is 1 + floor(horizon * u^k), u uniform in [0, 1). 1 is uniform, as
             in the paper; with 2 and a horizon of 32, the next pose is the goal 6 times as often.
         skip_reached: Whether rows that already are at their goal are left alone.
+        per_slice: Whether consecutive rows share a goal.
         poses: When a pose is the goal pose.
         keys: Where rows keep what. The goal's pose means nothing where its mask is False.
 
     Raises:
-        ValueError: If a probability is outside [0, 1], or ``nearness`` is less than 1.
-        KeyError: On sampling, if a row lacks a key; names the key and the argument that set it.
+        ValueError: If a probability is outside [0, 1], or ``nearness`` is less than 1; on sampling, if rows evidently
+            are slices, by their ``"index"``, and ``per_slice`` is False.
+        KeyError: On sampling, if a row lacks a key; names the key and the field of ``keys`` that set it.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -52,13 +69,14 @@ class DrawHindsightGoal(ReplayTransform):
 
     def __init__(
         self,
-        probability: Annealing = Annealing(0.3, 0.0, 60_000),  # noqa: B008 (frozen)
+        probability: Annealing = Annealing(0.3, 0.0, 60_000),
         *,
         rng: torch.Generator,
         nearness: float = 1.0,
         skip_reached: bool = True,
-        poses: Poses = PlanarPoses(),  # noqa: B008 (frozen)
-        keys: Keys = Keys(),  # noqa: B008 (frozen)
+        per_slice: bool = False,
+        poses: Poses = PlanarPoses(),
+        keys: Keys = Keys(),
     ) -> None:
         super().__init__(keys)
         for name in ("start", "end"):
@@ -66,10 +84,13 @@ class DrawHindsightGoal(ReplayTransform):
                 raise ValueError(f"probability.{name} must lie in [0, 1], got {getattr(probability, name)}.")
         if not nearness >= 1.0:
             raise ValueError(f"nearness must be at least 1, got {nearness}.")
+        if per_slice and not skip_reached:
+            raise ValueError("per_slice=True needs skip_reached=True: a slice ends where its goal is reached.")
         self.annealing = probability
         self.rng = rng
         self.nearness = nearness
         self.skip_reached = skip_reached
+        self.per_slice = per_slice
         self.poses = poses
         self.register_buffer("frames", torch.tensor(0))
 
@@ -93,11 +114,33 @@ class DrawHindsightGoal(ReplayTransform):
         horizon = self._read(tensordict, "hindsight", self.keys.hindsight_horizon)
         goal_pose = self._draw_pose(futures, horizon)
         mask = (self._uniform(horizon) < self.probability) & (horizon > 0)
-        if self.skip_reached:
-            mask = mask & ~self.poses.reached(pose, goal_pose).unsqueeze(-1)
+        if self.per_slice:
+            mask, goal_pose = self._share(tensordict, mask, goal_pose)
+        else:
+            refuse_slices(tensordict)
+            if self.skip_reached:
+                mask = mask & ~self.poses.reached(pose, goal_pose).unsqueeze(-1)
         tensordict.set(self.keys.goal_mask, mask)
         tensordict.set(self.keys.goal_pose, goal_pose)
         return tensordict
+
+    def _share(self, tensordict: TensorDictBase, mask: Tensor, goal_pose: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns mask and goal of each row's slice: those of its first row, up to the row that reaches the goal."""
+        futures = tensordict.get(self.keys.hindsight_pose)
+        futures = futures.reshape(-1, *futures.shape[-2:])
+        pose = tensordict.get(self.keys.pose).reshape(len(futures), -1)
+        first = first_of_slice(pose, futures)
+        goals = goal_pose.reshape(pose.shape)[first]
+        there = self.poses.reached(pose, goals).long()
+        met = there.cumsum(0)
+        passed = met - (met - there)[first] > 0  # at its goal here, or before in its slice
+        masks = mask.flatten()[first] & ~passed
+        if INIT_KEY in tensordict:
+            starts = first == torch.arange(len(first), device=first.device)
+            starts[1:] |= masks[:-1] & ~masks[1:]
+            init = tensordict.get(INIT_KEY)
+            tensordict.set(INIT_KEY, init | starts.reshape(init.shape))
+        return masks.reshape(mask.shape), goals.reshape(goal_pose.shape)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Returns the generator's state."""
@@ -116,3 +159,45 @@ class DrawHindsightGoal(ReplayTransform):
     def _uniform(self, like: Tensor) -> Tensor:
         """Draws from [0, 1), one number for each entry of ``like``."""
         return torch.rand(like.shape, generator=self.rng, device=self.rng.device).to(like.device)
+
+
+def first_of_slice(pose: Tensor, futures: Tensor) -> Tensor:
+    """Returns, for each of N rows, the first of the consecutive rows that it belongs to.
+
+    Args:
+        pose: ``[N, P]``.
+        futures: The poses that follow, ``[N, D, P]``. A row follows another if it is, and sees, the other's future.
+
+    Returns:
+        int64 ``[N]``.
+
+    Examples:
+        >>> x = torch.tensor([[0.0], [1.0], [2.0], [7.0], [8.0]])  # steps of 1, but for one jump
+        >>> first_of_slice(x, torch.stack([x + 1, x + 2], dim=1)).tolist()
+        [0, 0, 0, 3, 3]
+    """
+    follows = (torch.cat([pose.unsqueeze(1), futures[:, :-1]], 1)[1:] == futures[:-1]).flatten(1).all(1)
+    start = torch.arange(len(pose), device=pose.device)
+    start[1:] *= ~follows
+    return start.cummax(0).values
+
+
+def refuse_slices(rows: TensorDictBase) -> None:
+    """Refuses sampled rows ``[...]`` that evidently are slices of the storage, by their ``"index"``.
+
+    Rows of which most follow each other are slices, unless *all* do, as in ``buffer[:]``, or many come twice, as in
+    random samples of a tiny buffer.
+    """
+    index = rows.get("index", None)
+    if index is None or index.shape != rows.shape:
+        return
+    index = index.flatten()
+    pairs = len(index) - 1
+    following = int((index.diff() == 1).sum()) if pairs > 0 else 0
+    if not max(MANY, pairs / 2) <= following < pairs or 2 * len(index.unique()) <= len(index):
+        return
+    raise ValueError(
+        f"{following} of {pairs + 1} rows follow the row before them in the storage: these are slices, and a goal for "
+        "each row would show one slice several goals. Give DrawHindsightGoal(per_slice=True) and "
+        "SliceSampler(..., truncated_key=None, init_key=None), or sample rows at random."
+    )

@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from halgan_rl.keys import Keys
+from halgan_rl.keys import Keys, dotted
 from halgan_rl.transforms.base import ReplayTransform
 from halgan_rl.transforms.rows import replace_rows
 
@@ -15,7 +15,11 @@ SEEN = 16
 
 
 class Hallucinator(Protocol):
-    """Paints the goal into images as it would be seen from their poses."""
+    """Paints the goal into images as it would be seen from their poses.
+
+    One that paints images of one shape only says so in an attribute ``image_shape``, such as ``(64, 64, 3)``. Then
+    other images are refused when they are written.
+    """
 
     def __call__(self, pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
         """Paint one goal into the F images of each of N rows.
@@ -45,10 +49,13 @@ class HallucinateGoal(ReplayTransform):
     selects by the mask, for CUDA graphs and ``torch.compile``. Both give equal results if a row's hallucination depends
     on that row only; one that draws latents draws others for other batch sizes.
 
+    Images are uint8, height, width, channels. Others are refused when rows are written. Frames are stacked along the
+    channels, by :class:`torchrl.envs.CatFrames` with ``dim=-1``, and the hallucinator must know that they are.
+
     The hallucinator is no submodule: its weights stay out of ``state_dict()`` and its train or eval mode is its own.
 
     Args:
-        hallucinator: Maps pixels uint8 ``[N, 2, H, W, 3]``, pose ``[N, 2, P]`` and goal pose ``[N, 1, P]`` to pixels.
+        hallucinator: Maps pixels uint8 ``[N, 2, H, W, C]``, pose ``[N, 2, P]`` and goal pose ``[N, 1, P]`` to pixels.
 
     Keyword Args:
         pursue_unseen: Whether rows stay relabelled whose image at t does not show the goal, as in the paper. Seen is a
@@ -58,8 +65,9 @@ class HallucinateGoal(ReplayTransform):
 
     Raises:
         TypeError: If the hallucinator is not callable.
-        ValueError: On sampling, if the hallucinator returns another shape or dtype than it was given.
-        KeyError: On sampling, if a row lacks a key; names the key and the argument that set it.
+        ValueError: On writing, if images are not uint8, or of another shape than the hallucinator's or height, width,
+            channels; on sampling, if the hallucinator returns another shape or dtype than it was given.
+        KeyError: On writing and sampling, if a row lacks a key; names the key and the field of ``keys`` that set it.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -80,7 +88,7 @@ class HallucinateGoal(ReplayTransform):
         *,
         pursue_unseen: bool = True,
         fixed_shape: bool = False,
-        keys: Keys = Keys(),  # noqa: B008 (frozen)
+        keys: Keys = Keys(),
     ) -> None:
         super().__init__(keys)
         if not callable(hallucinator):
@@ -88,6 +96,24 @@ class HallucinateGoal(ReplayTransform):
         self.__dict__["hallucinator"] = hallucinator  # past nn.Module, which would register it
         self.pursue_unseen = pursue_unseen
         self.fixed_shape = fixed_shape
+
+    def _check_written(self, rows: TensorDictBase) -> None:
+        """Refuses images that the hallucinator could not paint."""
+        for key in (self.keys.pixels, self.keys.next("pixels")):
+            pixels = self._read(rows, "pixels", key)
+            name = f"{type(self).__name__}: the entry {dotted(key)}"
+            if pixels.dtype != torch.uint8:
+                raise ValueError(
+                    f"{name} is {pixels.dtype}, but images must be uint8, 0 to 255, as they are rendered: write "
+                    "them before they are scaled, without ToTensorImage, or convert: (255 * pixels).round().byte()."
+                )
+            check_image_shape(tuple(pixels.shape[rows.batch_dims :]), name, self.image_shape)
+
+    @property
+    def image_shape(self) -> tuple[int, ...] | None:
+        """The only shape of images that the hallucinator paints; None if it does not say."""
+        shape = getattr(self.hallucinator, "image_shape", None)
+        return None if shape is None else tuple(shape)
 
     def _edit_rows(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Paints the goal into the images of relabelled rows ``[...]``."""
@@ -125,7 +151,7 @@ class HallucinateGoal(ReplayTransform):
         root, following = self._hallucinate(pixels, next_pixels, *poses)
         if not self.pursue_unseen:
             mask = mask & _differ(pixels, root)
-        wide = mask[:, None, None, None]
+        wide = mask.reshape(-1, *[1] * (pixels.ndim - 1))
         return mask, torch.where(wide, root, pixels), torch.where(wide, following, next_pixels)
 
     def _hallucinate(
@@ -142,6 +168,37 @@ class HallucinateGoal(ReplayTransform):
         return edited[:, 0], edited[:, 1]
 
 
+def check_image_shape(shape: tuple[int, ...], name: str, wanted: tuple[int, ...] | None = None) -> None:
+    """Refuses what is no image ``[H, W, C]``.
+
+    Args:
+        shape: What to check.
+        name: What it is the shape of, for people.
+        wanted: The only shape to accept; None for any height, width and channels.
+
+    Raises:
+        ValueError: Names the shape and the remedy.
+    """
+    if wanted is not None:
+        if shape != wanted:
+            raise ValueError(
+                f"{name} has images {shape}, but this hallucinator paints {wanted}: render or resize them so, or take "
+                "a hallucinator that was made for them."
+            )
+        return
+    if len(shape) != 3:
+        raise ValueError(
+            f"{name} has images {shape}, but they must be height, width, channels. Stack frames along the channels: "
+            "CatFrames(N, dim=-1), or give the hallucinator an attribute image_shape if it paints such images."
+        )
+    if shape[2] > min(shape[:2]):
+        raise ValueError(
+            f"{name} has images {shape}, which look like channels, height, width; the channels must come last: append "
+            "PermuteTransform(dims=(-2, -1, -3)) to the environment, or give the hallucinator an attribute image_shape "
+            "if it paints such images."
+        )
+
+
 def _differ(before: Tensor, after: Tensor) -> Tensor:
-    """Tells which images uint8 ``[N, H, W, 3]`` differ by more than ``SEEN``."""
+    """Returns which images uint8 ``[N, ...]`` differ by more than ``SEEN``."""
     return (torch.maximum(before, after) - torch.minimum(before, after)).flatten(1).amax(1) > SEEN

@@ -10,7 +10,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import EGreedyModule, QValueActor
 from torchrl.objectives import DQNLoss, SoftUpdate
 
-from halgan_rl.transforms.annealing import Annealing
+from halgan_rl.transforms import Annealing, HindsightConfig
 from halgan_rl.transforms.pipelines import halgan
 from tests import toy
 from tests.transforms.rows import random_source
@@ -47,8 +47,7 @@ def train(probability: float, seed: int = 1, frames: int = FRAMES) -> tuple[floa
     pipeline = halgan(
         toy.hallucinate,
         rng=random_source(seed),
-        max_distance=16,
-        probability=Annealing(probability, probability / 2, frames),
+        config=HindsightConfig(Annealing(probability, probability / 2, frames), max_distance=16, nearness=1.0),
     )
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(frames), transform=pipeline, batch_size=64, generator=random_source(seed)

@@ -173,6 +173,11 @@ CASES = {
         {"pose": ("pose",), "hindsight": (("hindsight", "pose"), ("hindsight", "horizon"))},
         (("goal", "mask"), ("goal", "pose")),
     ),
+    "DrawHindsightGoal(per_slice)": Case(
+        lambda **keys: DrawHindsightGoal(always(0.5), rng=random_source(), per_slice=True, **keys),
+        {"pose": ("pose",), "hindsight": (("hindsight", "pose"), ("hindsight", "horizon"))},
+        (("goal", "mask"), ("goal", "pose")),
+    ),
     "HallucinateGoal": Case(
         lambda **keys: HallucinateGoal(invert, **keys),
         {

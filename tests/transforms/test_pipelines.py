@@ -8,20 +8,22 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.data.replay_buffers import SamplerWithoutReplacement, SliceSampler
+from torchrl.data.replay_buffers import SamplerWithoutReplacement
 from torchrl.envs import Compose, SerialEnv
 
 from halgan_rl.keys import Keys
 from halgan_rl.poses import PlanarPoses, relative_pose
 from halgan_rl.transforms import (
+    Annealing,
     DrawHindsightGoal,
     HallucinateGoal,
+    Hallucinator,
+    HindsightConfig,
     HindsightReward,
     ReplayTransform,
     StampFuturePoses,
     pipelines,
 )
-from halgan_rl.transforms.annealing import Annealing
 from tests import toy
 from tests.transforms.rows import (
     NESTED,
@@ -35,7 +37,7 @@ from tests.transforms.rows import (
 )
 
 DISTANCE = 6
-NAMED = {"halgan": pipelines.halgan, "oracle": pipelines.oracle}
+NAMED = {"halgan": pipelines.halgan, "her": pipelines.her}
 EVERY = pytest.mark.parametrize("pipeline", NAMED.values(), ids=NAMED.keys())
 
 
@@ -56,10 +58,19 @@ def buffer_with(transform: Compose | StampFuturePoses, **options: object) -> Ten
 
 
 def make(
-    pipeline: Callable = pipelines.halgan, probability: float | Annealing = 1.0, **options: object
+    method: Callable = pipelines.halgan,
+    probability: float | Annealing = 1.0,
+    *,
+    painter: Hallucinator = toy.hallucinate,
+    poses: PlanarPoses = PlanarPoses(),
+    keys: Keys = Keys(),
+    discount: float | None = None,
+    **options: object,
 ) -> pipelines.Hindsight:
     annealing = probability if isinstance(probability, Annealing) else always(probability)
-    return pipeline(toy.hallucinate, rng=random_source(), probability=annealing, max_distance=DISTANCE, **options)
+    config = HindsightConfig(annealing, **{"max_distance": DISTANCE, "nearness": 1.0, **options})
+    painters = (painter,) if method is pipelines.halgan else ()
+    return method(*painters, rng=random_source(), config=config, discount=discount, poses=poses, keys=keys)
 
 
 def filled(transform: Compose, frames: int = 420, **options: object) -> TensorDictReplayBuffer:
@@ -69,10 +80,10 @@ def filled(transform: Compose, frames: int = 420, **options: object) -> TensorDi
     return buffer
 
 
-@EVERY
-def test_the_parts_come_in_order(pipeline: Callable) -> None:
-    parts = [StampFuturePoses, DrawHindsightGoal, HallucinateGoal, HindsightReward]
-    assert [type(part) for part in make(pipeline)] == parts
+def test_the_parts_come_in_order() -> None:
+    stamp, draw, paint, reward = StampFuturePoses, DrawHindsightGoal, HallucinateGoal, HindsightReward
+    assert [type(part) for part in make(pipelines.halgan)] == [stamp, draw, paint, reward]
+    assert [type(part) for part in make(pipelines.her)] == [stamp, draw, reward]
 
 
 @EVERY
@@ -89,9 +100,28 @@ def test_unmasked_rows_are_untouched_and_masked_ones_are_not(pipeline: Callable)
     mask = relabelled["goal", "mask"].flatten()
     assert 10 < mask.sum() < 54
     assert_identical(relabelled[~mask].exclude("goal"), plain[~mask])
-    changed = relabelled["pixels"] != plain["pixels"]
-    assert changed.flatten(1).any(1)[mask].float().mean() > 0.9
+    assert (relabelled["next", "reward"] != plain["next", "reward"])[mask].any()
     assert_identical(*(each.select("pose", "action", "hindsight", ("next", "pose")) for each in (relabelled, plain)))
+
+
+def test_only_a_pipeline_with_a_painter_changes_images() -> None:
+    plain, painted, blind = (filled(each).sample() for each in (make(probability=0.0), make(), make(pipelines.her)))
+    mask = painted["goal", "mask"].flatten()
+    assert torch.equal(blind["goal", "mask"], painted["goal", "mask"])
+    assert (painted["pixels"] != plain["pixels"]).flatten(1).any(1)[mask].float().mean() > 0.9
+    assert torch.equal(blind["pixels"], plain["pixels"])
+    assert torch.equal(blind["next", "reward"], painted["next", "reward"])
+
+
+def test_plain_replay_relabels_nothing() -> None:
+    pipeline = pipelines.none()
+    buffer = buffer_with(pipeline)
+    buffer.extend(collect(70, None)[0])
+    pipeline.step(100)
+    sample = buffer.sample()
+    assert (len(pipeline), pipeline.probability, pipeline.hallucinator) == (0, 0.0, None)
+    assert pipeline.relabelled(sample).shape == (64, 1)
+    assert not pipeline.relabelled(sample).any()
 
 
 def test_a_relabelled_row_shows_and_rewards_its_goal() -> None:
@@ -115,9 +145,8 @@ def paint_what_is_ahead(pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tens
 @pytest.mark.parametrize("fixed_shape", [False, True])
 def test_unseen_goals_leave_no_trace_and_all_seen_ones_are_pursued(fixed_shape: bool) -> None:
     plain = filled(StampFuturePoses(DISTANCE)).sample(2_000)
-    options = {"max_distance": DISTANCE, "probability": always(1.0), "fixed_shape": fixed_shape}
     drawn, relabelled = (
-        filled(pipelines.halgan(paint_what_is_ahead, rng=random_source(), pursue_unseen=unseen, **options))
+        filled(make(painter=paint_what_is_ahead, pursue_unseen=unseen, fixed_shape=fixed_shape))
         for unseen in (True, False)
     )
     drawn, relabelled = drawn.sample(2_000)["goal"], relabelled.sample(2_000)
@@ -178,14 +207,6 @@ def test_a_sampler_without_replacement_gives_relabelled_rows() -> None:
     assert sample["next", "terminated"].any()
 
 
-def test_slices_are_relabelled_row_by_row() -> None:
-    sampler = SliceSampler(num_slices=8, end_key=("next", "done"), truncated_key=None)
-    sample = filled(make(), sampler=sampler).sample()
-    reached = PlanarPoses().reached(sample["next", "pose"], sample["goal", "pose"])[:, None] & sample["goal", "mask"]
-    assert reached.any()
-    assert sample["next", "terminated"][reached].all()
-
-
 def test_nested_keys_do_the_same() -> None:
     flat, nested = buffer_with(make()), buffer_with(make(keys=NESTED))
     for batch in collect(210):
@@ -221,35 +242,52 @@ def test_a_checkpoint_resumes_with_the_same_samples(tmp_path: Path) -> None:
 
 def test_options_reach_the_parts() -> None:
     poses, annealing = PlanarPoses(distance=0.2, angle=0.3), Annealing(0.8, 0.1, 50)
-    pipeline = make(
+    stamp, draw, paint, reward = make(
         probability=annealing,
         nearness=2.0,
-        poses=poses,
-        keys=NESTED,
         success_reward=3.0,
+        success_threshold=0.25,
+        max_step=0.75,
+        n_steps=2,
+        discount=0.9,
         pursue_unseen=False,
         fixed_shape=True,
+        poses=poses,
+        keys=NESTED,
     )
-    stamp, draw, paint, reward = pipeline
-    assert stamp.max_distance == DISTANCE
-    assert (draw.annealing, draw.nearness) == (annealing, 2.0)
+    assert all(part.keys is NESTED for part in (stamp, draw, paint, reward))
     assert stamp.poses is draw.poses is reward.poses is poses
-    assert all(part.keys is NESTED for part in pipeline)
+    assert (stamp.max_distance, stamp.success_threshold, stamp.max_step) == (DISTANCE, 0.25, 0.75)
+    assert (stamp.n_steps, stamp.discount) == (reward.n_steps, reward.discount) == (2, 0.9)
+    assert (draw.annealing, draw.nearness) == (annealing, 2.0)
+    assert (paint.pursue_unseen, paint.fixed_shape) == (False, True)
     assert reward.success_reward == 3.0
-    assert not paint.pursue_unseen
-    assert paint.fixed_shape
 
 
-def test_defaults_are_those_of_the_parts() -> None:
+def test_defaults_are_those_of_the_parts_unless_others_learn_faster() -> None:
     pipeline = pipelines.halgan(invert, rng=random_source())
     alone = (
-        StampFuturePoses(),
-        DrawHindsightGoal(rng=random_source()),
+        StampFuturePoses(96),
+        DrawHindsightGoal(rng=random_source(), nearness=2.0),
         HallucinateGoal(invert),
         HindsightReward(),
     )
     for part, other in zip(pipeline, alone, strict=True):
         assert settings(part) == settings(other)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"max_distance": 0}, "max_distance must be at least 1 step"),
+        ({"n_steps": 0}, "n_steps must be at least 1"),
+        ({"max_distance": 3, "n_steps": 4}, "max_distance must be at least .* n_steps=4"),
+        ({"nearness": 0.5}, "nearness must be at least 1"),
+    ],
+)
+def test_a_configuration_that_would_fail_later_is_refused(options: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        HindsightConfig(**options)
 
 
 def settings(transform: ReplayTransform) -> dict[str, object]:
@@ -275,9 +313,3 @@ def test_a_pipeline_says_which_rows_it_relabelled() -> None:
     mask = pipeline.relabelled(sample)
     assert torch.equal(mask, sample["extras", "goal", "mask"])
     assert 0 < mask.sum() < 64
-
-
-@EVERY
-def test_an_unknown_option_is_named(pipeline: Callable) -> None:
-    with pytest.raises(TypeError, match="'probabilty'"):
-        pipeline(invert, rng=random_source(), probabilty=0.3)
