@@ -19,7 +19,7 @@ def layout_of(rows: TensorDictBase) -> Layout:
 
 
 def check_layout(layout: Layout, waiting: list[UnfinishedEpisode]) -> None:
-    """Refuses rows with other entries than those held back, which are to be written with them."""
+    """Refuses rows with other entries than those held back, together with which they will be written."""
     held = next((each.layout for each in waiting if each.count), layout)
     if held == layout:
         return
@@ -30,13 +30,14 @@ def check_layout(layout: Layout, waiting: list[UnfinishedEpisode]) -> None:
         )
         raise KeyError(
             f"These rows have {added} and lack {lacking}, unlike those before them, some of which are held back: write "
-            "the same entries always."
+            "the same entries always. If those before them were wrong, forget them: transform.drop_held_rows()."
         )
     key = next(key for key in held if held[key] != layout[key])
     (dtype, shape), (new_dtype, new_shape) = held[key], layout[key]
     raise ValueError(
         f"In these rows {dotted(key)} is {new_dtype} {tuple(new_shape)}, in those before them, some of which are held "
-        f"back, {dtype} {tuple(shape)}: write one dtype and shape only."
+        f"back, {dtype} {tuple(shape)}: write one dtype and shape only. If those before them were wrong, forget them: "
+        "transform.drop_held_rows()."
     )
 
 

@@ -30,7 +30,7 @@ from halgan_rl.replay import frame_checkpointer, frame_storage, free_room
 from halgan_rl.replay.frame_storage import FrameStorage
 from halgan_rl.replay.frame_table import OVERHEAD
 from halgan_rl.transforms import StampFuturePoses
-from tests.transforms.test_pipelines import collect, make
+from tests.replay.parking import collect, relabelling
 from tests.transforms.rows import assert_identical, random_source
 
 SHAPE = (2, 5, 3)
@@ -327,7 +327,10 @@ def test_a_collectors_rows_need_a_frame_each_and_the_last_of_the_episodes() -> N
 
 
 def test_relabelled_samples_are_the_same_too() -> None:
-    frames, reference = filled(FrameStorage(200), transform=make()), filled(LazyTensorStorage(200), transform=make())
+    frames, reference = (
+        filled(FrameStorage(200), transform=relabelling()),
+        filled(LazyTensorStorage(200), transform=relabelling()),
+    )
     sample = frames.sample()
     assert sample["goal", "mask"].any()
     assert_identical(sample, reference.sample())
