@@ -4,13 +4,13 @@ VENV ?= .venv
 BENCH_VENV ?= .venv-bench
 BIN := $(VENV)/bin
 SEED ?= 0
-HINDSIGHT ?= halgan
-OUT ?= runs/navigate-$(HINDSIGHT)-seed$(SEED)-$(shell date +%Y%m%d-%H%M%S)
+METHOD ?= halgan
+OUT ?= runs/navigate-$(METHOD)-seed$(SEED)-$(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: navigate test test-slow check format bench weights clean
+.PHONY: navigate test test-slow check format bench weights gpu-check clean
 
-navigate: $(VENV)/ready  ## train a navigating agent (make navigate SEED=1 HINDSIGHT=oracle)
-	$(BIN)/python recipes/ddpg_navigate.py --hindsight $(HINDSIGHT) --seed $(SEED) --out $(OUT)
+navigate: $(VENV)/ready  ## train a navigating agent (make navigate SEED=1 METHOD=oracle)
+	$(BIN)/python recipes/ddpg_navigate.py --method $(METHOD) --seed $(SEED) --out $(OUT)
 
 test: $(VENV)/ready check  ## all checks and the test suite, under ten minutes
 	$(BIN)/python -m pytest
@@ -34,11 +34,14 @@ bench: $(BENCH_VENV)/ready  ## speed and memory side by side with the peers, in 
 weights: $(VENV)/ready  ## train the shipped generators again (a few minutes)
 	for environment in navigate-2m navigate-4m pick-and-place-2m pebble; do \
 	  run=runs/weights-$$environment shipped=halgan_rl/hallucination/shipped/$$environment; \
-	  test $$environment = pebble && noise=0.05 || noise=0.7; \
-	  $(BIN)/python recipes/train_halgan.py --environment $$environment --seed 0 --latent-noise $$noise --out $$run && \
+	  $(BIN)/python recipes/train_generator.py --environment $$environment --seed 0 --out $$run && \
 	  cp $$run/generator.safetensors $$shipped.safetensors && \
 	  cp $$run/generator.json $$shipped.json && \
 	  cp $$run/hallucinations.png $$shipped.png || exit 1; done
+
+gpu-check: $(VENV)/ready  ## on a machine with a GPU, ten minutes: its tests, and update and generator timings
+	$(BIN)/python -m pytest -m gpu tests/gpu
+	$(BIN)/python -m benchmarks.gpu
 
 $(VENV)/ready: pyproject.toml setup.py constraints.txt
 	$(PYTHON) -m venv $(VENV)

@@ -33,18 +33,14 @@ from torchrl.data import TensorDictReplayBuffer
 
 from benchmarks.rounds import take_turns, warm_heap
 from benchmarks.tables import Table, report
-from halgan_rl.experiment.config import HindsightConfig
-from halgan_rl.experiment.metrics import Report
-from halgan_rl.experiment.run import (
-    EVALUATION_SEED,
-    make_buffer,
-    make_collector,
-    make_folder,
-    make_hallucinator,
-    make_hindsight,
-)
+from halgan_rl.agents.agent import Agent
+from halgan_rl.experiment.config import RunConfig
+from halgan_rl.experiment.methods import make_hindsight
+from halgan_rl.experiment.presets import changed
+from halgan_rl.experiment.run import EVALUATION_SEED, make_agent, make_buffer, make_collector
 from halgan_rl.training.evaluation_process import evaluate_at_once
-from halgan_rl.training.loop import Agent, Schedule, train
+from halgan_rl.training.loop import COLUMNS, train
+from halgan_rl.training.metrics import Report
 from recipes import ddpg_navigate, ddpg_pick_place, ddqn_pebble
 
 RECIPES = {
@@ -136,7 +132,7 @@ class Stopwatch:
 Round = Callable[[], Mapping[str, float]]
 
 
-def make_round(recipe: Any, benchmark: Benchmark, out: Path, **changes: Any) -> Round:
+def make_round(recipe: Any, benchmark: Benchmark, out: Path, changes: Mapping[str, Any]) -> Round:
     """Return what goes on with a training for a round, and tells the time of each part [s a frame].
 
     Args:
@@ -145,15 +141,14 @@ def make_round(recipe: Any, benchmark: Benchmark, out: Path, **changes: Any) -> 
         out: an unused folder, for metrics that nobody reads.
         changes: of the configuration.
     """
-    config: HindsightConfig = dataclasses.replace(
-        recipe.PRESETS["default"], warmup_frames=benchmark.rows, total_frames=ENDLESS, out=out, **changes
-    )
-    hallucinator = make_hallucinator(config, halgan_envs)
-    env, evaluation_env = halgan_envs.make(config.environment, seed=config.seed), halgan_envs.make(config.environment)
-    agent = recipe.make_agent(config, env.action_spec)
-    hindsight = make_hindsight(config, hallucinator)
-    buffer = make_buffer(config, hindsight)
-    collector = iter(make_collector(config, halgan_envs, env, agent.explorer))
+    values = {"training.warmup_frames": benchmark.rows, "total_frames": ENDLESS, "out": out}
+    config = changed(recipe.DEFAULT, values | dict(changes))
+    domain = halgan_envs.domain(config.environment)
+    agent = make_agent(config, domain)
+    hindsight = make_hindsight(config, domain)
+    buffer = make_buffer(config.training, hindsight, seed=config.seed)
+    env, evaluation_env = domain.make(seed=config.seed), domain.make()
+    collector = iter(make_collector(config, domain, agent.explorer, env=env))
     while len(buffer) < benchmark.rows:
         buffer.extend(next(collector))
 
@@ -166,18 +161,18 @@ def make_round(recipe: Any, benchmark: Benchmark, out: Path, **changes: Any) -> 
         agent,
         buffer=buffer,
         hindsight=hindsight,
-        schedule=Schedule(benchmark.frames, 0, config.frames_per_update, benchmark.frames),
-        batch_size=config.batch_size,
-        policy_average=config.policy_average,
+        config=changed(config, {"training.warmup_frames": 1}).training,
+        total_frames=benchmark.frames,
+        evaluate_every=benchmark.frames,
         evaluate=watch.timed(EVALUATION, partial(evaluate_at_once, evaluation_env, seeds=starts)),
-        report=Report(make_folder(config, agent, ())),
+        report=Report(COLUMNS, lambda row: None),
         save=lambda network: None,
         label=config.environment,
     )
 
     def go_on() -> Mapping[str, float]:
         watch.restart()
-        run(collector=(collect() for _ in range(benchmark.frames // config.frames_per_batch)))
+        run(collector=(collect() for _ in range(benchmark.frames // config.training.frames_per_batch)))
         watch.switch(LOOP)
         return a_frame(watch.seconds, config, benchmark)
 
@@ -198,12 +193,12 @@ def watch_parts(
     watch.time_method(UPDATE, agent, "update")
 
 
-def a_frame(seconds: Mapping[str, float], config: HindsightConfig, benchmark: Benchmark) -> dict[str, float]:
+def a_frame(seconds: Mapping[str, float], config: RunConfig, benchmark: Benchmark) -> dict[str, float]:
     """Return times of a frame [s] for those of a round."""
     per_frame = {part: seconds[part] / benchmark.frames for part in PARTS}
-    episodes = config.evaluation_starts / benchmark.starts * benchmark.episode_share
+    episodes = config.evaluation.starts / benchmark.starts * benchmark.episode_share
     for part in (EVALUATION_RENDERING, EVALUATION):
-        per_frame[part] = seconds[part] * episodes / config.evaluate_every
+        per_frame[part] = seconds[part] * episodes / config.evaluation.every
     return per_frame
 
 
@@ -225,7 +220,7 @@ def main(benchmark: Benchmark) -> None:
     torch.manual_seed(0)
     warm_heap()
     with TemporaryDirectory() as folder:
-        runs = {name: make_round(recipe, benchmark, Path(folder, name)) for name, recipe in RECIPES.items()}
+        runs = {name: make_round(recipe, benchmark, Path(folder, name), {}) for name, recipe in RECIPES.items()}
         rounds = take_turns(runs, benchmark.rounds)
     times = {
         name: {part: statistics.median(values[part] for values in taken) for part in PARTS}

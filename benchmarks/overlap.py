@@ -23,12 +23,13 @@ import tyro
 
 from benchmarks.frame_time import RECIPES
 from benchmarks.tables import Table, report
+from halgan_rl.experiment.presets import changed
 from halgan_rl.experiment.run_folder import read_metrics
 
 WAYS: dict[str, dict[str, bool]] = {
-    "all in one process": {"background_evaluation": False, "background_collection": False},
-    "evaluation beside": {"background_evaluation": True, "background_collection": False},
-    "evaluation and collection beside": {"background_evaluation": True, "background_collection": True},
+    "all in one process": {"evaluation.background": False, "training.background_collection": False},
+    "evaluation beside": {"evaluation.background": True, "training.background_collection": False},
+    "evaluation and collection beside": {"evaluation.background": True, "training.background_collection": True},
 }
 
 
@@ -45,9 +46,8 @@ class Benchmark:
 def milliseconds_a_frame(recipe: ModuleType, benchmark: Benchmark, changes: dict[str, Any]) -> float:
     """Train once; return the wall time of a frame [ms], from the first evaluation to the last."""
     with TemporaryDirectory() as folder:
-        config = dataclasses.replace(
-            recipe.PRESETS["default"], total_frames=benchmark.frames, out=Path(folder, "run"), film_starts=1, **changes
-        )
+        tiny = {"total_frames": benchmark.frames, "out": Path(folder, "run"), "evaluation.film_starts": 1}
+        config = changed(recipe.DEFAULT, tiny | changes)
         recipe.main(config)
         metrics = read_metrics(config.out / "metrics.csv")
     frames, seconds = ([values[0], values[-1]] for values in (metrics["frames"], metrics["seconds"]))

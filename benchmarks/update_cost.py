@@ -6,7 +6,7 @@ Usage::
 
 Times updates of the recipe (sample, loss, backward, both optimizer steps, target update), sampled sixteen at once as in
 a training (:func:`halgan_rl.training.loop.draw_batches`), with no hindsight, with goals that are drawn and rewarded but not
-painted, with HALGAN looked up in the bank, with its generator itself and with the simulator as oracle, at the share of
+painted, with HALGAN looked up in the bank, with its generator itself and with the simulator as oracle, at the fraction of
 rows for which the recipe draws a goal at the start and at its mean over a run. All of them are painted; about half show
 nothing of their goal and are not relabelled in the end. Medians of processor time in alternating rounds; quote the
 ratios, machines are noisy.
@@ -23,20 +23,23 @@ import torch
 import tyro
 from tensordict import TensorDict
 from torch import Tensor
-from torchrl.data import Bounded
 
 from benchmarks.rounds import ratio, seconds_a_call, take_turns, warm_heap
 from benchmarks.tables import Table, report
-from halgan_rl.agents.ddpg import make_agent
-from halgan_rl.experiment.run import make_buffer, make_hallucinator, make_hindsight
-from halgan_rl.hallucination.hallucinators import Hallucinator
+from halgan_rl.experiment.config import RunConfig
+from halgan_rl.experiment.methods import make_hindsight, relabelling
+from halgan_rl.experiment.presets import changed
+from halgan_rl.experiment.run import make_agent, make_buffer
 from halgan_rl.training.loop import draw_batches
-from recipes.ddpg_navigate import Config
+from halgan_rl.transforms import pipelines
+from halgan_rl.transforms.pipelines import Hindsight
+from recipes.ddpg_navigate import DEFAULT
 
+NONE = {"method": "none"}
 PAINTERS: dict[str, dict[str, Any]] = {
-    "bank": {"bank": True},
-    "generator": {"bank": False},
-    "oracle": {"hindsight": "oracle"},
+    "bank": {"painter.bank": True},
+    "generator": {"painter.bank": False},
+    "oracle": {"method": "oracle"},
 }
 """Who paints, as changes of the recipe's configuration."""
 
@@ -53,17 +56,15 @@ class Benchmark:
     """Random transitions in the buffer."""
 
 
-def make_updates(
-    config: Config, rollout: TensorDict, hallucinator: Hallucinator | None, count: int
-) -> Callable[[], None]:
+def make_updates(config: RunConfig, rollout: TensorDict, hindsight: Hindsight, count: int) -> Callable[[], None]:
     """Return updates of the recipe on a buffer of its own."""
-    config = dataclasses.replace(config, replay_capacity=len(rollout))
-    buffer = make_buffer(config, make_hindsight(config, hallucinator))
+    domain = halgan_envs.domain(config.environment)
+    buffer = make_buffer(changed(config, {"training.replay_capacity": len(rollout)}).training, hindsight, seed=0)
     buffer.extend(rollout.clone())
-    agent = make_agent(config, Bounded(-1.0, 1.0, (2,)))
+    agent = make_agent(config, domain)
 
     def run() -> None:
-        for batch in draw_batches(buffer, count, config.batch_size):
+        for batch in draw_batches(buffer, count, config.training.batch_size):
             agent.update(batch)
 
     return run
@@ -80,22 +81,27 @@ def main(benchmark: Benchmark) -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
     warm_heap()
-    default = Config()
-    env = halgan_envs.make(default.environment, seed=0)
+    default = DEFAULT
+    domain = halgan_envs.domain(default.environment)
+    env = domain.make(seed=0)
     rollout = env.rollout(benchmark.rows, break_when_any_done=False)
     env.close()
-    mean_share = default.hallucination_start * (1 - default.total_frames / default.hallucination_frames / 2)
-    updates = {"none": make_updates(default, rollout, None, benchmark.updates)}
-    for share in (default.hallucination_start, mean_share):
-        config = dataclasses.replace(default, hallucination_start=share)
-        updates[f"not painted, {share:.1%} drawn"] = make_updates(config, rollout, paint_nothing, benchmark.updates)
+    start = default.hindsight.probability.start
+    mean = (start + default.hindsight.probability.at(default.total_frames)) / 2
+    updates = {
+        "none": make_updates(default, rollout, make_hindsight(changed(default, NONE), domain), benchmark.updates)
+    }
+    for fraction in (start, mean):
+        config = changed(default, {"hindsight.probability.start": fraction})
+        unpainted = pipelines.halgan(paint_nothing, **relabelling(config, domain))
+        updates[f"not painted, {fraction:.1%} drawn"] = make_updates(config, rollout, unpainted, benchmark.updates)
         for name, changes in PAINTERS.items():
-            hallucinator = make_hallucinator(dataclasses.replace(config, **changes), halgan_envs)
-            updates[f"{name}, {share:.1%} drawn"] = make_updates(config, rollout, hallucinator, benchmark.updates)
+            hindsight = make_hindsight(changed(config, changes), domain)
+            updates[f"{name}, {fraction:.1%} drawn"] = make_updates(config, rollout, hindsight, benchmark.updates)
     measures = {name: partial(seconds_a_call, run, 1) for name, run in updates.items()}
     seconds = take_turns(measures, benchmark.rounds)
     title = (
-        f"Hallucination in a DDPG update, batch {default.batch_size}, one thread, medians of {benchmark.rounds} "
+        f"Hallucination in a DDPG update, batch {default.training.batch_size}, one thread, medians of {benchmark.rounds} "
         f"alternating rounds of {benchmark.updates}, processor time; ratios are medians of those of each round."
     )
     lines = [
@@ -107,7 +113,7 @@ def main(benchmark: Benchmark) -> None:
         ]
         for name, value in seconds.items()
     ]
-    report("update_cost", [Table(title, ("painter", "ms an update", "share of it", "ratio to none"), lines)])
+    report("update_cost", [Table(title, ("painter", "ms an update", "fraction of it", "ratio to none"), lines)])
 
 
 if __name__ == "__main__":

@@ -54,12 +54,13 @@ from pathlib import Path
 import halgan_envs
 
 from halgan_rl.agents.ddpg import PAPER, DDPGConfig
-from halgan_rl.experiment.config import PAPER_PAINTER, PAPER_TRAINING, HindsightConfig, RunConfig
+from halgan_rl.experiment.config import PAPER_PAINTER, PAPER_TRAINING, RunConfig
 from halgan_rl.experiment.methods import make_hindsight
 from halgan_rl.experiment.presets import parse_config
 from halgan_rl.experiment.run import Run, make_agent, make_buffer, prepare
 from halgan_rl.training.loop import TrainingConfig
 from halgan_rl.transforms.annealing import Annealing
+from halgan_rl.transforms.hindsight_config import HindsightConfig
 
 DEFAULT = RunConfig(
     out=Path("runs/ddpg_navigate"),

@@ -1,6 +1,7 @@
 """What is done about missing rewards: one function a method, looked up by name."""
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 
@@ -23,13 +24,13 @@ def none(config: RunConfig, domain: Domain) -> pipelines.Hindsight:
 
 def her(config: RunConfig, domain: Domain) -> pipelines.Hindsight:
     """Naive hindsight experience replay: reward and termination of a goal that the image does not show."""
-    return pipelines.her(**_relabelling(config, domain))
+    return pipelines.her(**relabelling(config, domain))
 
 
 def halgan(config: RunConfig, domain: Domain) -> pipelines.Hindsight:
     """HALGAN: a trained generator, or the table of its output, paints the goal."""
     hallucinator = make_hallucinator(config.painter, domain, seed=config.seed)
-    return pipelines.halgan(hallucinator, **_relabelling(config, domain))
+    return pipelines.halgan(hallucinator, **relabelling(config, domain))
 
 
 def oracle(config: RunConfig, domain: Domain) -> pipelines.Hindsight:
@@ -38,7 +39,7 @@ def oracle(config: RunConfig, domain: Domain) -> pipelines.Hindsight:
         raise ValueError(f"method='oracle' needs a goal_renderer, which the domain {domain.name!r} lacks")
     rng = torch.Generator().manual_seed(config.seed)
     renderer = _with_flags(domain.goal_renderer(), config.painter, domain, rng)
-    return pipelines.halgan(renderer, **_relabelling(config, domain))
+    return pipelines.halgan(renderer, **relabelling(config, domain))
 
 
 METHODS: dict[str, Method] = {"halgan": halgan, "her": her, "oracle": oracle, "none": none}
@@ -71,6 +72,7 @@ def make_hallucinator(config: PainterConfig, domain: Domain, *, seed: int) -> Ha
         fingerprint=domain.fingerprint,
         poses=domain.poses,
         image_shape=domain.image_shape,
+        frame_stack=domain.frame_stack,
         allow_other_mujoco=config.allow_other_mujoco,
     )
     painter: Hallucinator
@@ -85,7 +87,13 @@ def _with_flags(painter: Hallucinator, config: PainterConfig, domain: Domain, rn
     return RandomFlags(painter, poses=domain.poses, rng=rng) if config.random_flags else painter
 
 
-def _relabelling(config: RunConfig, domain: Domain) -> dict:
-    """Returns what all pipelines with relabelled rows are told."""
+def relabelling(config: RunConfig, domain: Domain) -> dict[str, Any]:
+    """Returns the arguments that all pipelines with relabelled rows share."""
     rng = torch.Generator().manual_seed(config.seed)
-    return {"config": config.hindsight, "rng": rng, "poses": domain.poses, "keys": domain.keys}
+    return {
+        "config": config.hindsight,
+        "rng": rng,
+        "discount": config.agent.discount,
+        "poses": domain.poses,
+        "keys": domain.keys,
+    }

@@ -1,8 +1,9 @@
 """Presets: several instances of one configuration, chosen by one flag, changed by the others."""
 
 import argparse
+import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import tyro
 
@@ -12,7 +13,7 @@ Config = TypeVar("Config")
 def parse_config(
     presets: Mapping[str, Config], args: Sequence[str] | None = None, *, description: str | None
 ) -> Config:
-    """Read a command line: ``--preset`` chooses the defaults of all other flags.
+    """Reads a command line: ``--preset`` chooses the defaults of all other flags.
 
     Args:
         presets: configurations (dataclasses with a field ``preset``) by name; the first is the default.
@@ -36,3 +37,20 @@ def parse_config(
     parser.add_argument("--preset", choices=presets, default=next(iter(presets)))
     chosen = parser.parse_known_args(args)[0].preset
     return tyro.cli(type(presets[chosen]), args=args, default=presets[chosen], description=description)
+
+
+def changed(config: Config, changes: Mapping[str, Any]) -> Config:
+    """Returns a nested configuration with some values changed.
+
+    Args:
+        config: a dataclass, whose fields may be dataclasses.
+        changes: new values by their names on the command line, ``{"agent.tau": 0.1}``.
+
+    Raises:
+        AttributeError: if there is no such field.
+    """
+    for name, value in changes.items():
+        first, _, rest = name.partition(".")
+        inner = changed(getattr(config, first), {rest: value}) if rest else value
+        config = dataclasses.replace(config, **{first: inner})  # type: ignore[type-var]
+    return config

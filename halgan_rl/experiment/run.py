@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.data import TensorDictReplayBuffer
-from torchrl.envs import ExcludeTransform
+from torchrl.envs import EnvBase, ExcludeTransform
 from torchrl.record.loggers import Logger
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
@@ -218,15 +218,20 @@ def paint_stored_rows(
     return {"failed": rows[keys.pixels], **painted}
 
 
-def make_collector(config: RunConfig, domain: Domain, explorer: TensorDictModuleBase) -> BaseCollector:
-    """Returns what steps the environment: uniformly random actions first, then the exploring policy."""
+def make_collector(
+    config: RunConfig, domain: Domain, explorer: TensorDictModuleBase, *, env: EnvBase | None = None
+) -> BaseCollector:
+    """Returns what steps the environment: uniformly random actions first, then the exploring policy.
+
+    It makes its environment, or steps ``env``; in the background it always makes one.
+    """
     settings: dict[str, Any] = {
         "frames_per_batch": config.training.frames_per_batch,
         "total_frames": config.total_frames,
         "init_random_frames": config.training.warmup_frames,
     }
     if not config.training.background_collection:
-        env = domain.make(seed=config.seed)
+        env = env or domain.make(seed=config.seed)
         return Collector(env, explorer, track_traj_ids=False, auto_register_policy_transforms=False, **settings)
     collector = BackgroundCollector(
         domain.make, explorer, postproc=ExcludeTransform("collector"), num_threads=config.threads, **settings

@@ -15,7 +15,7 @@ from halgan_rl.agents.agent import Agent
 from halgan_rl.keys import Keys
 from halgan_rl.training.evaluation import Evaluation
 from halgan_rl.training.metrics import Means, Report
-from halgan_rl.transforms.pipelines import Hindsight
+from halgan_rl.transforms.pipelines import Hindsight, check_sampler
 
 COLUMNS = (
     "frames",
@@ -121,6 +121,7 @@ def train(
     Returns:
         The policy of the averaged network, on the CPU.
     """
+    check_sampler(buffer)
     average = AveragedModel(agent.network, multi_avg_fn=get_ema_multi_avg_fn(config.policy_average))
     policy = agent.make_policy(average.module)
     means = Means()

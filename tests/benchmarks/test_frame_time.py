@@ -4,6 +4,7 @@ import pytest
 
 from benchmarks import frame_time
 from benchmarks.frame_time import PARTS, Benchmark, Stopwatch, a_frame, describe, make_round
+from halgan_rl.experiment.presets import changed
 
 TINY = Benchmark(rounds=1, frames=32, rows=112, starts=1)
 
@@ -41,7 +42,7 @@ def test_a_part_that_fails_ends():
 @pytest.mark.parametrize("recipe", frame_time.RECIPES.values(), ids=frame_time.RECIPES)
 def test_the_parts_of_a_training_are_all_that_it_takes(recipe, tmp_path, monkeypatch):
     monkeypatch.setattr(frame_time, "a_frame", lambda seconds, *_: dict(seconds))
-    go_on = make_round(recipe, TINY, tmp_path / "run", bank=False)
+    go_on = make_round(recipe, TINY, tmp_path / "run", {"painter.bank": False})
     go_on()
     started = time.process_time()
     seconds = go_on()
@@ -51,7 +52,7 @@ def test_the_parts_of_a_training_are_all_that_it_takes(recipe, tmp_path, monkeyp
 
 
 def test_evaluation_is_spread_over_the_frames_between_two():
-    config = frame_time.ddpg_navigate.Config(evaluate_every=1_000, evaluation_starts=50)
+    config = changed(frame_time.ddpg_navigate.DEFAULT, {"evaluation.every": 1_000, "evaluation.starts": 50})
     benchmark = Benchmark(frames=100, starts=5, episode_share=0.5)
     times = a_frame(dict.fromkeys(PARTS, 8.0), config, benchmark)
     assert times[frame_time.UPDATE] == 8.0 / 100

@@ -1,6 +1,5 @@
 """What tests of the recipes share."""
 
-import dataclasses
 from contextlib import AbstractContextManager
 from typing import Any
 from unittest import mock
@@ -20,15 +19,6 @@ TINY = {
     "evaluation.background": False,
 }
 """Values of a run of a few seconds that reaches its updates."""
-
-
-def changed(config: Any, changes: dict[str, Any]) -> Any:
-    """Return a nested configuration with some values changed, named as on the command line."""
-    for name, value in changes.items():
-        first, _, rest = name.partition(".")
-        value = changed(getattr(config, first), {rest: value}) if rest else value
-        config = dataclasses.replace(config, **{first: value})
-    return config
 
 
 def without_pictures() -> AbstractContextManager[Any]:

@@ -14,12 +14,12 @@ from safetensors.torch import load_file
 
 import tests.recipes
 from halgan_rl.experiment.methods import make_hindsight
-from halgan_rl.experiment.presets import parse_config
+from halgan_rl.experiment.presets import changed, parse_config
 from halgan_rl.experiment.run_folder import read_metrics
 from halgan_rl.transforms.annealing import Annealing
 from recipes import play
 from recipes.ddpg_navigate import DEFAULT, PRESETS, main
-from tests.recipes import changed, without_pictures
+from tests.recipes import without_pictures
 
 TINY = changed(DEFAULT, tests.recipes.TINY)
 
@@ -109,7 +109,7 @@ FAILING = """
 import pathlib, sys
 from halgan_rl.agents.agent import Agent
 from recipes.ddpg_navigate import main
-from tests.recipes import changed
+from halgan_rl.experiment.presets import changed
 from tests.recipes.test_ddpg_navigate import TINY
 
 def fail(agent, batch):

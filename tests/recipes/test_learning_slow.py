@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from halgan_rl.experiment.presets import changed
 from halgan_rl.experiment.run_folder import read_metrics
 from recipes.ddpg_navigate import DEFAULT, main
-from tests.recipes import changed
 
 
 def success_rates(out: Path, method: str) -> list[float]:

@@ -10,10 +10,10 @@ import torch
 from safetensors.torch import load_file
 
 import tests.recipes
-from halgan_rl.experiment.presets import parse_config
+from halgan_rl.experiment.presets import changed, parse_config
 from halgan_rl.experiment.run_folder import read_metrics
 from recipes import ddpg_pick_place, ddqn_pebble, play
-from tests.recipes import changed, without_pictures
+from tests.recipes import without_pictures
 
 TINY = tests.recipes.TINY | {"total_frames": 96, "training.frames_per_update": 4, "evaluation.every": 48}
 RECIPES = {"pick & place": ddpg_pick_place, "pebble": ddqn_pebble}
