@@ -1,14 +1,13 @@
 """A generator that paints by coordinates: cheap, and exact under shifts of the goal across the image."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
+from halgan_rl.hallucination.generators.base import LEAK, HallucinationGenerator, check_count, check_number
 from halgan_rl.hallucination.generators.goal_encoding import Configuration
-from halgan_rl.hallucination.generators.paper import LEAK, HallucinationGenerator
-
-SIZE = 64
 
 
 class CoordinateGenerator(HallucinationGenerator):
@@ -19,19 +18,27 @@ class CoordinateGenerator(HallucinationGenerator):
     draw. Moving the goal is then a change of a few numbers and not, as in a stack of convolutions, a picture to be
     learned for each place; bearing comes out right from the start, and an image costs less than half of the paper's.
 
-    The output is a matte, ``[N, 4, 64, 64]``: three channels of colour in [-1, 1] and an opacity in [0, 1].
+    The output is a matte for each of the S stacked frames, ``[N, C + S, H, W]``: the C colours in [-1, 1], in the order
+    of the image's channels, then an opacity in [0, 1] for each frame.
 
     Args:
         configuration: how the network is told the relative pose.
         pose_size: P, entries of a pose.
-        latent_size: Z; the latent is drawn from N(0, 1). What it has to tell is little: which way the goal is turned.
+        latent_size: Z; the latent is drawn from N(0, 1). It has little to say: which way the goal is turned.
+
+    Keyword Args:
+        image_shape: height H, width W and channels C of the images.
+        frame_stack: S, how many frames are stacked along the channels, each with 1 or 3 of them.
         width: channels of each pixel-wise layer.
         depth: pixel-wise layers behind the first.
         opacity: mean opacity before training; small, so that training starts near the identity.
         gain: factor on the half-planes' slopes; large, so that edges become sharp soon.
 
     Attributes:
-        coordinates: u, v in (-1, 1) and 1 of each pixel, row by row, ``[4096, 3]``.
+        coordinates: u, v in (-1, 1) and 1 of each pixel, row by row, ``[H * W, 3]``.
+
+    Raises:
+        ValueError: if a value has another type or is out of range.
     """
 
     coordinates: Tensor
@@ -42,14 +49,22 @@ class CoordinateGenerator(HallucinationGenerator):
         pose_size: int = 3,
         latent_size: int = 2,
         *,
+        image_shape: Sequence[int] = (64, 64, 3),
+        frame_stack: int = 1,
         width: int = 32,
         depth: int = 2,
         opacity: float = 0.05,
         gain: float = 10.0,
     ) -> None:
-        super().__init__(configuration, pose_size, latent_size)
+        check_count("width", width, most=1024)
+        check_count("depth", depth, least=0, most=16)
+        check_number("opacity", opacity, 0, 1)
+        check_number("gain", gain, 0, 1e6)
+        super().__init__(configuration, pose_size, latent_size, image_shape=image_shape, frame_stack=frame_stack)
         self.arguments |= {"width": width, "depth": depth, "opacity": opacity, "gain": gain}
         self.gain = gain
+        channels = self.image_shape[2]
+        self._parts = [channels, frame_stack]
         last = nn.Linear(64, 3 * width)
         self.place = nn.Sequential(
             nn.Linear(self.encoding.size + latent_size, 64),
@@ -61,22 +76,20 @@ class CoordinateGenerator(HallucinationGenerator):
         layers: list[nn.Module] = []
         for _ in range(depth):
             layers += [nn.Linear(width, width), nn.LeakyReLU(LEAK, inplace=True)]
-        matte = nn.Linear(width, 4)
+        matte = nn.Linear(width, channels + frame_stack)
         self.paint = nn.Sequential(*layers, matte)
         with torch.no_grad():
             last.bias[: 2 * width].normal_(0, 1.5)
-            matte.bias[3] = math.log(opacity / (1 - opacity))
-        axis = (torch.arange(SIZE) + 0.5) / (SIZE / 2) - 1
-        v, u = torch.meshgrid(axis, axis, indexing="ij")
-        coordinates = torch.stack([u, v, torch.ones_like(u)], -1).reshape(-1, 3)
-        self.register_buffer("coordinates", coordinates, persistent=False)
+            matte.bias[channels:] = math.log(opacity / (1 - opacity))
+        self.register_buffer("coordinates", _pixel_coordinates(*self.image_shape[:2]), persistent=False)
 
     def forward(self, features: Tensor, latent: Tensor) -> Tensor:
-        """Return the matte ``[N, 4, 64, 64]``, in channels_last."""
-        return self.matte_at(self.coordinates, features, latent).unflatten(1, (SIZE, SIZE)).permute(0, 3, 1, 2)
+        """Returns mattes ``[N, C + S, H, W]``, in channels_last, for features ``[N, K]`` and latents ``[N, Z]``."""
+        matte = self.matte_at(self.coordinates, features, latent)
+        return matte.unflatten(1, self.image_shape[:2]).permute(0, 3, 1, 2)
 
     def matte_at(self, coordinates: Tensor, features: Tensor, latent: Tensor) -> Tensor:
-        """Return the matte at some coordinates only, ``[N, M, 4]``.
+        """Returns mattes at some coordinates only, ``[N, M, C + S]``.
 
         Args:
             coordinates: rows of the attribute ``coordinates``, ``[M, 3]``.
@@ -85,14 +98,26 @@ class CoordinateGenerator(HallucinationGenerator):
         """
         planes = self.gain * self.place(torch.cat([features, latent], -1)).unflatten(-1, (3, -1))
         hidden = nn.functional.leaky_relu_(coordinates @ planes, LEAK)
-        colour, opacity = self.paint(hidden).split([3, 1], -1)
+        colour, opacity = self.paint(hidden).split(self._parts, -1)
         return torch.cat([colour.tanh(), opacity.sigmoid()], -1)
 
     def sample_latent(self, count: int, rng: torch.Generator) -> Tensor:
-        """Draw latents ``[count, Z]`` from N(0, 1)."""
+        """Draws latents ``[count, Z]`` from N(0, 1)."""
         return torch.randn(count, self.latent_size, generator=rng)
 
     def compose(self, images: Tensor, change: Tensor) -> Tensor:
-        """Lay the matte over images; exactly the identity where the opacity is 0."""
-        colour, opacity = change.split([3, 1], 1)
+        """Returns images ``[N, C, H, W]`` under mattes; exactly the images where the opacity is 0."""
+        colour, opacity = change.split(self._parts, 1)
+        if self.frame_stack > 1:
+            opacity = opacity.repeat_interleave(self.colours, 1)  # each frame's opacity on all of its colours
         return images + opacity * (colour - images)
+
+
+def _pixel_coordinates(height: int, width: int) -> Tensor:
+    """Returns u to the right and v downwards, in (-1, 1), and 1 of each pixel's centre, ``[height * width, 3]``."""
+    v, u = torch.meshgrid(_centres(height), _centres(width), indexing="ij")
+    return torch.stack([u, v, torch.ones_like(u)], -1).reshape(-1, 3)
+
+
+def _centres(count: int) -> Tensor:
+    return (torch.arange(count) + 0.5) / (count / 2) - 1

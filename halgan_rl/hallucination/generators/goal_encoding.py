@@ -5,9 +5,12 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from halgan_rl.poses import relative_pose
+from halgan_rl.poses import PlanarPoses, relative_pose
 
 Configuration = Literal["polar", "planar"]
+MOST_FLAGS = 16
+"""Flags select one of up to 2^n goals."""
+_POSES = PlanarPoses()
 
 
 class GoalEncoding(nn.Module):
@@ -18,14 +21,18 @@ class GoalEncoding(nn.Module):
     - ``"planar"``: the whole relative pose: x ahead [m], y left [m], yaw difference [rad]. The features have sine
       and cosine of the yaw: what the goal pose faces lies at a *linear* function of them in the frame of the pose.
 
-    Flags of the task, the entries of a pose after the third, follow in both.
+    Flags of the task follow in both, see :class:`~halgan_rl.poses.PlanarPoses`.
 
     Args:
         kind: which description.
         pose_size: P, entries of a pose.
 
+    Attributes:
+        flags: how many entries of a pose are flags.
+        size: K, entries of the features.
+
     Raises:
-        ValueError: if the kind is unknown or a pose has fewer than three entries.
+        ValueError: if the kind is unknown, or a pose has no planar part, or more flags than can be told apart.
     """
 
     mean: Tensor
@@ -34,17 +41,21 @@ class GoalEncoding(nn.Module):
     def __init__(self, kind: Configuration = "planar", pose_size: int = 3) -> None:
         super().__init__()
         if kind not in ("polar", "planar"):
-            raise ValueError(f"configuration={kind!r} is unknown: choose 'polar' or 'planar'")
-        if pose_size < 3:
-            raise ValueError(f"pose_size={pose_size} is too small: a pose has at least x, y and yaw")
+            raise ValueError(f"configuration={kind!r} is unknown: choose 'polar' or 'planar'.")
+        if not isinstance(pose_size, int) or not _POSES.size <= pose_size <= _POSES.size + MOST_FLAGS:
+            raise ValueError(
+                f"pose_size={pose_size!r} must be {_POSES.size} for x, y and yaw, and 1 more for each of at most "
+                f"{MOST_FLAGS} flags."
+            )
         self.kind = kind
+        self.flags = pose_size - _POSES.size
         self.lengths = 1 if kind == "polar" else 2
-        self.size = self.lengths + (1 if kind == "polar" else 2) + pose_size - 3
+        self.size = self.lengths + (1 if kind == "polar" else 2) + self.flags
         self.register_buffer("mean", torch.zeros(self.size))
         self.register_buffer("scale", torch.ones(self.size))
 
     def labels(self, pose: Tensor, goal_pose: Tensor) -> Tensor:
-        """Describe goal poses ``[..., P]`` as seen from poses ``[..., P]``, both in the world frame; broadcasts.
+        """Describes goal poses ``[..., P]`` as seen from poses ``[..., P]``, both in the world frame; broadcasts.
 
         Returns:
             ``[..., L]``: lengths, then one angle, then flags.
@@ -54,28 +65,27 @@ class GoalEncoding(nn.Module):
             x, y, yaw = relative.unbind(-1)
             distance = torch.hypot(x, y)
             relative = torch.stack([distance, torch.where(distance < 1e-4, yaw, torch.atan2(y, x))], -1)
-        return torch.cat([relative, pose[..., 3:].expand(*relative.shape[:-1], -1)], -1)
+        return torch.cat([relative, _POSES.flag_part(pose).expand(*relative.shape[:-1], -1)], -1)
 
     def forward(self, labels: Tensor) -> Tensor:
-        """Return standardised features ``[..., K]`` of labels ``[..., L]``."""
+        """Returns standardised features ``[..., K]`` of labels ``[..., L]``."""
         return (self._features(labels) - self.mean) / self.scale
 
     def standardise(self, labels: Tensor) -> None:
-        """Set mean and scale so that the features of these labels ``[N, L]`` have mean 0 and variance 1."""
+        """Sets mean and scale so that the features of these labels ``[N, L]`` have mean 0 and variance 1."""
         features = self._features(labels)
         self.mean.copy_(features.mean(0))
         self.scale.copy_(features.std(0).clamp_min(1e-3))
 
     def mirror(self, labels: Tensor) -> Tensor:
-        """Return the labels ``[..., L]`` of images that are mirrored left to right."""
+        """Returns the labels ``[..., L]`` of images that are mirrored left to right."""
         signs = torch.ones(labels.shape[-1], device=labels.device)
         signs[1 : self.lengths + 1] = -1
         return labels * signs
 
     def noise(self, length: float, angle: float) -> Tensor:
-        """Return standard deviations ``[L]``: of lengths [m], of the angle [rad], and 0 for flags."""
-        flags = self.size - self.lengths - (1 if self.kind == "polar" else 2)
-        return torch.tensor([length] * self.lengths + [angle] + [0.0] * flags)
+        """Returns standard deviations ``[L]``: of lengths [m], of the angle [rad], and 0 for flags."""
+        return torch.tensor([length] * self.lengths + [angle] + [0.0] * self.flags)
 
     def _features(self, labels: Tensor) -> Tensor:
         if self.kind == "polar":

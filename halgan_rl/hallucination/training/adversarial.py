@@ -1,4 +1,4 @@
-"""Training of the hallucination generator: a conditional Wasserstein GAN with a regression auxiliary task.
+"""Adversarial training of a generator: a conditional Wasserstein GAN with a regression auxiliary task.
 
 Source: Sahni et al., NeurIPS 2019, section 3 and appendix; gradient penalty from Gulrajani et al., NeurIPS 2017.
 """
@@ -10,14 +10,23 @@ import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from halgan_rl.hallucination.generators.paper import Discriminator, HallucinationGenerator
-from halgan_rl.hallucination.training.data import Frames, matching_flags
+from halgan_rl.hallucination.generators.base import HallucinationGenerator
+from halgan_rl.hallucination.training.data import Frames, check_data, matching_settings
+from halgan_rl.hallucination.training.discriminator import Discriminator
+from halgan_rl.poses import PlanarPoses
 from halgan_rl.transforms.pixels import to_float
 
 
 @dataclass(frozen=True)
-class GanSettings:
-    """Hyper-parameters of the game; the defaults are the paper's."""
+class AdversarialConfig:
+    """How generators are trained adversarially; the defaults are the paper's.
+
+    Raises:
+        ValueError: if a count is out of range.
+    """
+
+    steps: int = 50_000
+    """Generator steps; 0 leaves adversarial training out."""
 
     batch_size: int = 64
     """Images of a batch, real ones and fake ones each."""
@@ -41,25 +50,37 @@ class GanSettings:
     """Standard deviation of the noise on the labels of real images: lengths [m], angles [rad]."""
     bandwidth: float = 1.0
     """Width of the kernel density from which configurations of fakes are drawn, in units of Scott's rule."""
-    mirror: bool = False
-    """Mirror half of the real images left to right, and their labels with them."""
     average_decay: float = 0.0
     """Decay of the moving average of the generator's weights, which is what is kept; 0 keeps the last ones."""
     discriminator_steps_ahead: int = 0
     """Discriminator steps before the first generator step."""
 
+    def __post_init__(self) -> None:
+        """Refuses values that make no sense."""
+        for name, least in (("steps", 0), ("batch_size", 1), ("critic_steps", 1), ("penalty_interval", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}={getattr(self, name)} must be at least {least}.")
 
-class HalganTrainer:
-    """Plays the game between generator and discriminator, one generator step a call.
+
+class AdversarialTrainer:
+    """Trains generator and discriminator against each other, one generator step a call.
 
     Args:
         generator: learns to draw the goal; its encoding is used as it is.
         discriminator: learns to judge realism and to regress the configuration's features.
-        near_goal: ``pixels`` uint8 [N, 64, 64, 3], ``pose`` [N, P] and ``goal_pose`` [N, P] of near-goal frames.
-        failed: ``pixels`` uint8 [M, 64, 64, 3] and ``pose`` [M, P] of failed frames, into which goals are painted; the
-            poses' flags tell which goal.
-        settings: hyper-parameters.
+
+    Keyword Args:
+        near_goal: ``pixels`` uint8 ``[N, H, W, C]``, ``pose`` and ``goal_pose`` ``[N, P]`` of near-goal frames.
+        failed: ``pixels`` uint8 ``[M, H, W, C]`` and ``pose`` ``[M, P]`` of failed frames, into which goals are
+            painted: those that the poses' flags select.
+        config: hyper-parameters.
         rng: draws everything that is random.
+        poses: which entries of a pose are flags; each setting of them has a goal of its own.
+        mirror: mirror half of the real images left to right, and their labels with them.
+
+    Raises:
+        KeyError: if an entry of the frames is missing.
+        ValueError: if frames or poses are other than the generator's.
     """
 
     def __init__(
@@ -69,27 +90,31 @@ class HalganTrainer:
         *,
         near_goal: Frames,
         failed: Frames,
-        settings: GanSettings,
+        config: AdversarialConfig,
         rng: torch.Generator,
+        poses: PlanarPoses = PlanarPoses(),
+        mirror: bool = False,
     ) -> None:
-        self.generator, self.discriminator, self.settings, self.rng = generator, discriminator, settings, rng
+        check_data(generator, near_goal, failed, poses)
+        self.generator, self.discriminator, self.config, self.rng = generator, discriminator, config, rng
+        self._mirror = mirror
         self._encoding = generator.encoding
         self._real_pixels, self._failed_pixels = near_goal["pixels"], failed["pixels"]
-        self._real_flags, self._failed_flags = matching_flags(near_goal, failed)
+        self._real_settings, self._failed_settings = matching_settings(near_goal, failed, poses)
         self._labels = self._encoding.labels(near_goal["pose"], near_goal["goal_pose"])
-        self._noise = self._encoding.noise(*settings.label_noise)
-        self._kernel = settings.bandwidth * scott_kernel(self._labels, flags=near_goal["pose"].shape[-1] - 3)
+        self._noise = self._encoding.noise(*config.label_noise)
+        self._kernel = config.bandwidth * scott_kernel(self._labels, flags=self._encoding.flags)
         self._generator_optimizer, self._discriminator_optimizer = (
-            torch.optim.Adam(network.parameters(), lr=rate, betas=settings.betas)
+            torch.optim.Adam(network.parameters(), lr=rate, betas=config.betas)
             for network, rate in (
-                (generator, settings.generator_learning_rate),
-                (discriminator, settings.discriminator_learning_rate),
+                (generator, config.generator_learning_rate),
+                (discriminator, config.discriminator_learning_rate),
             )
         )
-        average = get_ema_multi_avg_fn(settings.average_decay)
+        average = get_ema_multi_avg_fn(config.average_decay)
         self._average = AveragedModel(generator, multi_avg_fn=average, use_buffers=True)
         self._penalty_countdown = 0
-        self._ahead = settings.discriminator_steps_ahead
+        self._ahead = config.discriminator_steps_ahead
 
     @property
     def average(self) -> HallucinationGenerator:
@@ -97,7 +122,7 @@ class HalganTrainer:
         return cast(HallucinationGenerator, self._average.module)
 
     def step(self) -> dict[str, Tensor]:
-        """Train the discriminator, then the generator.
+        """Trains the discriminator, then the generator.
 
         Returns:
             Scalars: ``critic_distance``, the estimate of the Wasserstein distance; ``auxiliary_real`` and
@@ -105,7 +130,7 @@ class HalganTrainer:
             generator changes in images in [-1, 1].
         """
         metrics: dict[str, Tensor] = {}
-        for _ in range(self.settings.critic_steps + self._ahead):
+        for _ in range(self.config.critic_steps + self._ahead):
             metrics |= self._train_discriminator()
         self._ahead = 0
         metrics |= self._train_generator()
@@ -113,8 +138,8 @@ class HalganTrainer:
         return metrics
 
     def _train_discriminator(self) -> dict[str, Tensor]:
-        """Tell real from fake, and regress the configurations of real images."""
-        settings = self.settings
+        """Tells real from fake, and regresses the configurations of real images."""
+        config = self.config
         real, features = self._draw_real()
         with torch.no_grad():
             _, _, fake = self._draw_fake()
@@ -122,28 +147,28 @@ class HalganTrainer:
         fake_score, _ = self.discriminator(fake)
         distance = real_score.mean() - fake_score.mean()
         auxiliary = nn.functional.mse_loss(guess, features)
-        loss = settings.auxiliary_weight * auxiliary - distance
+        loss = config.auxiliary_weight * auxiliary - distance
         if self._penalty_countdown == 0:
-            self._penalty_countdown = settings.penalty_interval
+            self._penalty_countdown = config.penalty_interval
             penalty = self._gradient_penalty(real, fake)
-            loss = loss + settings.penalty_interval * settings.penalty_weight * penalty
+            loss = loss + config.penalty_interval * config.penalty_weight * penalty
         self._penalty_countdown -= 1
         _descend(self._discriminator_optimizer, loss)
         return {"critic_distance": distance.detach(), "auxiliary_real": auxiliary.detach()}
 
     def _train_generator(self) -> dict[str, Tensor]:
-        """Please the critic, show the goal at its configuration, and change little."""
-        settings = self.settings
+        """Makes goals that the critic takes for real, at their configurations, and that change little."""
+        config = self.config
         images, features, fake = self._draw_fake()
         score, guess = self.discriminator(fake)
         auxiliary = nn.functional.mse_loss(guess, features)
         change = (fake - images).square().mean()
-        loss = settings.auxiliary_weight * auxiliary + settings.change_weight * change - score.mean()
+        loss = config.auxiliary_weight * auxiliary + config.change_weight * change - score.mean()
         _descend(self._generator_optimizer, loss)
         return {"auxiliary_fake": auxiliary.detach(), "change": change.detach()}
 
     def _gradient_penalty(self, real: Tensor, fake: Tensor) -> Tensor:
-        """Return the mean square deviation from 1 of the critic's slope between real and fake images."""
+        """Returns the mean square deviation from 1 of the critic's slope between real and fake images."""
         mix = torch.rand(len(real), 1, 1, 1, generator=self.rng)
         between = torch.lerp(real, fake, mix).requires_grad_()
         score, _ = self.discriminator(between)
@@ -151,27 +176,27 @@ class HalganTrainer:
         return (slope.flatten(1).norm(dim=1) - 1).square().mean()
 
     def _draw_real(self) -> tuple[Tensor, Tensor]:
-        """Draw near-goal images and the features of their noisy labels."""
+        """Draws near-goal images and the features of their noisy labels."""
         rows, flip = self._draw_rows()
         images, labels = to_float(self._real_pixels[rows]), self._mirror_labels(rows, flip)
         images = torch.where(flip[:, None, None, None], images.flip(3), images)
         return images, self._encoding(labels + self._noise * torch.randn(labels.shape, generator=self.rng))
 
     def _draw_fake(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Draw failed images and features from the kernel density; return both, and the images with goals."""
+        """Draws failed images and features from the kernel density; returns both, and the images with goals."""
         rows, flip = self._draw_rows()
         labels = self._mirror_labels(rows, flip)
         features = self._encoding(labels + torch.randn(labels.shape, generator=self.rng) @ self._kernel.T)
-        same_goal = self._real_flags[rows, None] == self._failed_flags
+        same_goal = self._real_settings[rows, None] == self._failed_settings
         images = to_float(self._failed_pixels[same_goal.float().multinomial(1, generator=self.rng).squeeze(1)])
         latent = self.generator.sample_latent(len(labels), self.rng)
         return images, features, self.generator.compose(images, self.generator(features, latent))
 
     def _draw_rows(self) -> tuple[Tensor, Tensor]:
-        """Draw rows of the near-goal data, and which of them to mirror."""
-        size = (self.settings.batch_size,)
+        """Draws rows of the near-goal data, and which of them to mirror."""
+        size = (self.config.batch_size,)
         rows = torch.randint(len(self._labels), size, generator=self.rng)
-        return rows, (torch.rand(size, generator=self.rng) < 0.5) & self.settings.mirror
+        return rows, (torch.rand(size, generator=self.rng) < 0.5) & self._mirror
 
     def _mirror_labels(self, rows: Tensor, flip: Tensor) -> Tensor:
         labels = self._labels[rows]
@@ -179,7 +204,7 @@ class HalganTrainer:
 
 
 def scott_kernel(labels: Tensor, *, flags: int = 0) -> Tensor:
-    """Return a factor of the covariance of a Gaussian kernel density by Scott's rule.
+    """Returns a factor of the covariance of a Gaussian kernel density by Scott's rule.
 
     Args:
         labels: ``[N, L]``.
