@@ -27,6 +27,12 @@ def test_metrics_come_back_in_their_columns(tmp_path: Path) -> None:
     assert read_metrics(folder.file("metrics.csv")) == {"frames": [2000.0, 4000.0], "eval/success_rate": [0.25, 0.5]}
 
 
+def test_large_numbers_of_frames_keep_all_their_digits(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path / "run", columns=("frames", "train/loss"))
+    folder.write_metrics({"frames": 1_234_567, "train/loss": 0.123456789})
+    assert folder.file("metrics.csv").read_text().splitlines()[1] == "1234567,0.123457"
+
+
 def test_a_missing_column_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(KeyError, match="frames"):
         RunFolder(tmp_path / "run", columns=("frames",)).write_metrics({"seconds": 1.0})

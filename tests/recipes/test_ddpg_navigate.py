@@ -160,6 +160,21 @@ def test_what_a_run_is_told_of_goals_reaches_its_hindsight() -> None:
     assert domain.poses.flags == ("held",)
 
 
+def test_a_run_builds_one_environment_each_to_train_to_evaluate_and_to_film(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    halgan_envs.domain("navigate-2m")  # builds the goal renderer's, once in a process
+    built, initialise = [], halgan_envs.Environment.__init__
+
+    def count(self: halgan_envs.Environment, *args: Any, **kwargs: Any) -> None:
+        built.append(self)
+        initialise(self, *args, **kwargs)
+
+    monkeypatch.setattr(halgan_envs.Environment, "__init__", count)
+    main(changed(TINY, {"out": tmp_path / "run"}))
+    assert len(built) == 3
+
+
 def test_a_folder_that_holds_a_run_is_refused_first(tmp_path: Path) -> None:
     (tmp_path / "metrics.csv").write_text("precious")
     with pytest.raises(FileExistsError, match="already holds a run"):

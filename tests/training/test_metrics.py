@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from halgan_rl.experiment.metrics import Report
 from halgan_rl.experiment.run_folder import RunFolder, read_metrics
 from halgan_rl.training.evaluation import Evaluation
+from halgan_rl.training.metrics import Report
 
 COLUMNS = ("frames", "seconds", "eval/success_rate", "train/loss", "train/unheard_of")
 
@@ -29,7 +29,7 @@ class Log:
 
 def test_a_row_waits_for_its_evaluation_and_for_those_before_it(tmp_path: Path) -> None:
     folder, log = RunFolder(tmp_path / "run", columns=COLUMNS), Log()
-    report = Report(folder, log)
+    report = Report(folder.columns, folder.write_metrics, log)
     first, second = Future(), Future()
     report.add({"frames": 10, "train/loss": 2.0}, first)
     report.add({"frames": 20}, second)
@@ -37,6 +37,7 @@ def test_a_row_waits_for_its_evaluation_and_for_those_before_it(tmp_path: Path) 
     report.write()
     assert read_metrics(folder.file("metrics.csv")) == {}
     assert math.isnan(report.success)
+    assert report.shown_success == "-"
 
     first.set_result(evaluation(0.25))
     report.write()
@@ -49,7 +50,8 @@ def test_a_row_waits_for_its_evaluation_and_for_those_before_it(tmp_path: Path) 
 
 
 def test_waiting_writes_all_and_raises_what_an_evaluation_raised(tmp_path: Path) -> None:
-    report = Report(folder := RunFolder(tmp_path / "run", columns=COLUMNS))
+    folder = RunFolder(tmp_path / "run", columns=COLUMNS)
+    report = Report(folder.columns, folder.write_metrics)
     good, bad = Future(), Future()
     good.set_result(evaluation(1.0))
     bad.set_exception(ValueError("lost"))
