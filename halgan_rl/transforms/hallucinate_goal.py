@@ -99,15 +99,18 @@ class HallucinateGoal(ReplayTransform):
 
     def _check_written(self, rows: TensorDictBase) -> None:
         """Refuses images that the hallucinator could not paint."""
+        shapes = []
         for key in (self.keys.pixels, self.keys.next("pixels")):
-            pixels = self._read(rows, "pixels", key)
-            name = f"{type(self).__name__}: the entry {dotted(key)}"
+            pixels, name = self._read(rows, "pixels", key), f"{type(self).__name__}: the entry {dotted(key)}"
             if pixels.dtype != torch.uint8:
                 raise ValueError(
                     f"{name} is {pixels.dtype}, but images must be uint8, 0 to 255, as they are rendered: write "
                     "them before they are scaled, without ToTensorImage, or convert: (255 * pixels).round().byte()."
                 )
-            check_image_shape(tuple(pixels.shape[rows.batch_dims :]), name, self.image_shape)
+            shapes.append(tuple(pixels.shape[rows.batch_dims :]))
+            check_image_shape(shapes[-1], name, self.image_shape)
+        if shapes[0] != shapes[1]:
+            raise ValueError(f"{name} has images {shapes[1]}, but {dotted(self.keys.pixels)} has {shapes[0]}.")
 
     @property
     def image_shape(self) -> tuple[int, ...] | None:
@@ -189,7 +192,8 @@ def check_image_shape(shape: tuple[int, ...], name: str, wanted: tuple[int, ...]
     if len(shape) != 3:
         raise ValueError(
             f"{name} has images {shape}, but they must be height, width, channels. Stack frames along the channels: "
-            "CatFrames(N, dim=-1), or give the hallucinator an attribute image_shape if it paints such images."
+            "CatFrames(N, dim=-1). Give grey images a channel: UnsqueezeTransform(-1). Or give the hallucinator an "
+            "attribute image_shape if it paints such images."
         )
     if shape[2] > min(shape[:2]):
         raise ValueError(

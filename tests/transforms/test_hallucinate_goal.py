@@ -1,8 +1,12 @@
+import math
+
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import Tensor, nn
-from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
 
+from halgan_rl.keys import dotted
 from halgan_rl.transforms import HallucinateGoal
 from tests import toy
 from tests.transforms.rows import assert_identical, invert, sampled_rows
@@ -146,3 +150,92 @@ def test_a_hallucinator_that_returns_something_else_is_named(wrong: object, retu
 def test_what_cannot_be_called_is_refused() -> None:
     with pytest.raises(TypeError, match=r"must be callable .*'generator\.safetensors'"):
         HallucinateGoal("generator.safetensors")
+
+
+def written(shape: tuple[int, ...], dtype: torch.dtype = torch.uint8, key: object = "pixels") -> TensorDict:
+    """Rows ``[2, 7]`` as an environment writes them, with other images under one key."""
+    rows = TensorDict({"pixels": torch.zeros(2, 7, 84, 60, 3, dtype=torch.uint8)}, batch_size=[2, 7])
+    rows["next"] = TensorDict({"pixels": rows["pixels"]}, batch_size=[2, 7])
+    rows[key] = torch.zeros(2, 7, *shape, dtype=dtype)
+    return rows
+
+
+BOTH = pytest.mark.parametrize("key", ["pixels", ("next", "pixels")], ids=["root", "next"])
+
+
+class PaintsOneShape:
+    """A hallucinator that knows its images."""
+
+    def __init__(self, *image_shape: int) -> None:
+        self.image_shape = image_shape
+
+    def __call__(self, pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
+        return pixels
+
+
+@pytest.mark.parametrize("shape", [(84, 84, 3), (64, 64, 1), (64, 48, 12), (5, 4, 4)])
+@pytest.mark.parametrize("knows", [False, True])
+def test_images_of_any_size_and_channels_may_be_written(shape: tuple[int, ...], knows: bool) -> None:
+    rows = written(shape)
+    rows["next", "pixels"] = rows["pixels"]
+    hallucinator = PaintsOneShape(*shape) if knows else invert
+    assert_identical(HallucinateGoal(hallucinator).inv(rows), rows)
+
+
+@BOTH
+@pytest.mark.parametrize("dtype", [torch.float32, torch.int64])
+def test_images_that_are_not_uint8_are_refused_when_they_are_written(dtype: torch.dtype, key: object) -> None:
+    with pytest.raises(ValueError, match=rf"the entry {dotted(key)} is {dtype}, .*uint8.*without ToTensorImage"):
+        HallucinateGoal(invert).inv(written((84, 60, 3), dtype, key))
+
+
+@BOTH
+@pytest.mark.parametrize("shape", [(3, 84, 60), (12, 84, 84), (1, 64, 64)])
+def test_images_with_their_channels_first_are_refused_when_they_are_written(shape: tuple, key: object) -> None:
+    with pytest.raises(ValueError, match=rf"the entry {dotted(key)} has images \({shape[0]}, .*PermuteTransform\(dims"):
+        HallucinateGoal(invert).inv(written(shape, key=key))
+
+
+@BOTH
+@pytest.mark.parametrize("shape", [(4, 84, 60, 3), (84, 60)])
+def test_images_of_another_rank_are_refused_when_they_are_written(shape: tuple, key: object) -> None:
+    with pytest.raises(ValueError, match=rf"the entry {dotted(key)} has images \({shape[0]}, .*CatFrames\(N, dim=-1\)"):
+        HallucinateGoal(invert).inv(written(shape, key=key))
+
+
+@BOTH
+def test_images_that_the_hallucinator_does_not_paint_are_refused_when_they_are_written(key: object) -> None:
+    with pytest.raises(ValueError, match=rf"the entry {dotted(key)} has images \(64, 64, 3\), .* paints \(84, 60, 3\)"):
+        HallucinateGoal(PaintsOneShape(84, 60, 3)).inv(written((64, 64, 3), key=key))
+
+
+def test_images_of_another_shape_after_the_step_are_refused_when_they_are_written() -> None:
+    with pytest.raises(ValueError, match=r"next\.pixels has images \(60, 84, 3\), but pixels has \(84, 60, 3\)"):
+        HallucinateGoal(invert).inv(written((60, 84, 3), key=("next", "pixels")))
+
+
+def test_a_hallucinator_that_says_so_paints_images_of_any_rank() -> None:
+    rows = written((4, 84, 60, 3))
+    rows["next", "pixels"] = rows["pixels"]
+    HallucinateGoal(PaintsOneShape(4, 84, 60, 3)).inv(rows)
+
+
+def test_a_refused_batch_leaves_the_buffer_empty() -> None:
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(14), transform=HallucinateGoal(invert))
+    with pytest.raises(ValueError, match="PermuteTransform"):
+        buffer.extend(written((3, 84, 60)).reshape(14))
+    assert len(buffer) == 0
+
+
+@pytest.mark.parametrize("shape", [(12, 3, 4, 5, 3), (12, 20), (12, 4, 5)])
+def test_fixed_shapes_select_rows_whatever_the_rank_of_images(shape: tuple[int, ...]) -> None:
+    def darken(pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
+        return 255 - pixels
+
+    rows = sampled_rows()
+    rows["pixels"] = torch.arange(math.prod(shape)).remainder(200).reshape(shape).to(torch.uint8)
+    rows["next", "pixels"] = rows["pixels"] + 7
+    fixed = HallucinateGoal(darken, fixed_shape=True)(rows)
+    assert_identical(fixed, HallucinateGoal(darken)(rows))
+    changed = (fixed["pixels"] != rows["pixels"]).flatten(1).any(1)
+    assert changed.nonzero().flatten().tolist() == MASKED

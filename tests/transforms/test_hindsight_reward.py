@@ -50,3 +50,43 @@ def test_rewards_and_flags_without_a_trailing_dimension_are_not_broadcast() -> N
     for name in ("reward", "done", "terminated", "truncated"):
         flat["next", name] = rows["next", name].squeeze(-1)
     assert torch.equal(HindsightReward()(flat)["next", "reward"], HindsightReward()(rows)["next", "reward"].squeeze(-1))
+
+
+ENDINGS = ("reward", "done", "terminated", "truncated")
+
+
+@pytest.mark.parametrize("name", ENDINGS)
+def test_an_environment_without_one_of_the_flags_is_refused_when_rows_are_written(name: str) -> None:
+    rows = sampled_rows(6).exclude("goal", "hindsight", ("next", name))
+    with pytest.raises(KeyError, match=rf"misses the key next\.{name}, set by keys=Keys\({name}='{name}'\)"):
+        HindsightReward().inv(rows)
+
+
+def test_an_environment_without_a_time_limit_learns_the_remedy() -> None:
+    with pytest.raises(KeyError, match=r"StepCounter\(max_steps=\.\.\.\), appended to the environment"):
+        HindsightReward().inv(sampled_rows(6).exclude(("next", "truncated")))
+
+
+@pytest.mark.parametrize("name", ENDINGS)
+def test_entries_of_another_shape_are_refused_when_rows_are_written(name: str) -> None:
+    rows = sampled_rows(6)
+    rows["next", name] = rows["next", name].expand(6, 2)
+    with pytest.raises(ValueError, match=rf"the entry next\.{name} is .* \(6, 2\); it must hold .* a row, \(6, 1\)"):
+        HindsightReward().inv(rows)
+
+
+@pytest.mark.parametrize("name", ENDINGS[1:])
+def test_flags_that_are_no_bools_are_refused_when_rows_are_written(name: str) -> None:
+    rows = sampled_rows(6)
+    rows["next", name] = rows["next", name].float()
+    with pytest.raises(ValueError, match=rf"the entry next\.{name} is torch\.float32 .*bool"):
+        HindsightReward().inv(rows)
+
+
+def test_rows_with_and_without_a_trailing_dimension_may_be_written() -> None:
+    rows = sampled_rows(6)
+    flat = rows.clone()
+    for name in ENDINGS:
+        flat["next", name] = rows["next", name].squeeze(-1)
+    for each in (rows, flat, rows.reshape(2, 3)):
+        assert_identical(HindsightReward().inv(each), each)
