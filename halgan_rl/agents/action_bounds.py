@@ -56,23 +56,24 @@ class ActionScale(nn.Module):
         ([0.0, 1.0], [0.5, 1.0])
     """
 
-    middle: Tensor | None
-    reach: Tensor | None
+    middle: Tensor
+    reach: Tensor
 
     def __init__(self, low: Sequence[float], high: Sequence[float]) -> None:
         super().__init__()
-        unit = all(bound == -1.0 for bound in low) and all(bound == 1.0 for bound in high)
-        lowest, highest = torch.tensor(low), torch.tensor(high)
-        self.register_buffer("middle", None if unit else (lowest + highest) / 2, persistent=False)
-        self.register_buffer("reach", None if unit else (highest - lowest) / 2, persistent=False)
+        self.is_unit = all(bound == -1.0 for bound in low) and all(bound == 1.0 for bound in high)
+        if not self.is_unit:
+            lowest, highest = torch.tensor(low), torch.tensor(high)
+            self.register_buffer("middle", (lowest + highest) / 2, persistent=False)
+            self.register_buffer("reach", (highest - lowest) / 2, persistent=False)
 
     def from_unit(self, action: Tensor) -> Tensor:
         """Returns actions ``[..., A]`` within the bounds of ones in [-1, 1]."""
-        return action if self.reach is None else self.middle + self.reach * action
+        return action if self.is_unit else self.middle + self.reach * action
 
     def to_unit(self, action: Tensor) -> Tensor:
         """Returns actions ``[..., A]`` in [-1, 1] of ones within the bounds."""
-        return action if self.reach is None else (action - self.middle) / self.reach
+        return action if self.is_unit else (action - self.middle) / self.reach
 
 
 class BoundedTanh(nn.Module):

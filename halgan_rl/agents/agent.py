@@ -121,8 +121,8 @@ class Agent:
             shape = batch.get(key).shape[batch.ndim :]
             if batch.ndim and shape != self.image_shape:
                 raise ValueError(
-                    f"{dotted(key)} of a row is {list(shape)}, the agent was made for {list(self.image_shape)} (height, "
-                    "width, channels). Move channels last, and stack frames along the channels."
+                    f"{dotted(key)} of a row is {list(shape)}, the agent was made for {list(self.image_shape)} "
+                    "(height, width, channels). Move channels last, and stack frames along the channels."
                 )
 
     def _on_device(self, batch: TensorDictBase) -> TensorDictBase:
@@ -178,7 +178,7 @@ Network = TypeVar("Network", bound=nn.Module)
 
 
 def on_cpu(network: Network) -> Network:
-    """Returns a network itself if it is on the CPU, or else a copy there: for one frame the way to a GPU is too long."""
+    """Returns a network itself if it is on the CPU, or a copy there: for one frame the way to a GPU is too long."""
     return network if next(network.parameters()).device.type == "cpu" else copy.deepcopy(network).cpu()
 
 

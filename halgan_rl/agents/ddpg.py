@@ -115,7 +115,7 @@ def deterministic_policy(
     actor: Actor,
     *,
     keys: Keys = Keys(),
-    preactivation_key: NestedKey = "preactivation",  # noqa: B008 (frozen)
+    preactivation_key: NestedKey = "preactivation",
 ) -> TensorDictSequential:
     """Returns the policy of an actor: reads images, writes actions within their bounds and what went into their tanh.
 
@@ -218,7 +218,7 @@ def make_agent(
     *,
     action_spec: TensorSpec,
     image_shape: ImageShape,
-    keys: Keys = Keys(),  # noqa: B008 (frozen)
+    keys: Keys = Keys(),
     device: torch.device | str = "cpu",
 ) -> Agent:
     """Returns actor and critic, both on the camera image alone, how the actor explores, and how they learn.

@@ -83,7 +83,7 @@ class FirstBest(QValueModule):
         return nn.functional.one_hot(value.argmax(-1), value.shape[-1])
 
 
-def greedy_policy(network: QNetwork, *, keys: Keys = Keys()) -> TensorDictSequential:  # noqa: B008 (frozen)
+def greedy_policy(network: QNetwork, *, keys: Keys = Keys()) -> TensorDictSequential:
     """Returns the policy of an action-value network: reads images, writes the best action, one-hot, and all values.
 
     Args:
@@ -107,7 +107,7 @@ def make_agent(
     *,
     action_spec: TensorSpec,
     image_shape: ImageShape,
-    keys: Keys = Keys(),  # noqa: B008 (frozen)
+    keys: Keys = Keys(),
     device: torch.device | str = "cpu",
 ) -> Agent:
     """Returns a network of action values on the camera image alone, how it explores, and how it learns.

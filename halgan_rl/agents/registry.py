@@ -25,7 +25,7 @@ def make_agent(
     *,
     action_spec: TensorSpec,
     image_shape: ImageShape,
-    keys: Keys = Keys(),  # noqa: B008 (frozen)
+    keys: Keys = Keys(),
     device: torch.device | str = "cpu",
 ) -> Agent:
     """Returns the agent of the algorithm to which a configuration belongs; arguments as for its own ``make_agent``.

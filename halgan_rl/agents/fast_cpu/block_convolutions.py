@@ -11,7 +11,7 @@ Shapes: N images, G networks, C and O channels in and out, H and W pixels, block
 import itertools
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -133,7 +133,7 @@ def _lay_out(
     layers = [layer for network in networks for layer in network]
 
     # All parameters in a row behind a zero, and from there to their places, of which a parameter has many.
-    flat = [part for layer in layers for part in (layer.weight.flatten(), layer.bias)]
+    flat = [part for layer in layers for part in (layer.weight.flatten(), cast(Tensor, layer.bias))]
     parts = torch.cat([flat[0].new_zeros(1), *flat]).index_select(0, table.places).split(table.sizes)
 
     # Weights [O, h, w, C], which is how PyTorch's channels_last lays out [O, C, h, w].

@@ -66,7 +66,7 @@ def encode_together(pixels: Tensor, encoders: Sequence[Encoder]) -> tuple[Tensor
     return halved.flatten(1).chunk(len(encoders), -1)  # [N, G * 32, H / 16, W / 16] -> G times [N, F]
 
 
-def fits(encoder: nn.Module) -> bool:
+def fits(encoder: Encoder) -> bool:
     """Whether blocks compute what the layers of an encoder do, and divide its images.
 
     They do for the layers that :class:`~halgan_rl.agents.encoder.Encoder` builds, whatever the channels of the images,

@@ -199,7 +199,7 @@ def share_passes(loss: LossModule) -> bool:
     return True
 
 
-def _is_usual(network: nn.Module) -> bool:
+def _is_usual(network: Actor | Critic | QNetwork) -> bool:
     """Whether the encoder fits, and all that learns in the head are linear layers: see :func:`_pass_through`."""
     learning = [layer for layer in network.head if next(layer.parameters(), None) is not None]
     return fits(network.encoder) and all(type(layer) is nn.Linear for layer in learning)
