@@ -46,7 +46,7 @@ def test_every_name_has_an_id_by_one_rule():
 
 
 def test_gymnasium_imports_the_package_itself_if_asked_to():
-    env = gymnasium.make(f"envs:{ID}")
+    env = gymnasium.make(f"halgan_envs:{ID}")
     assert env.spec.id == ID
     env.close()
 
