@@ -136,6 +136,15 @@ def test_a_relabelled_row_shows_and_rewards_its_goal() -> None:
     assert sample["next", "terminated"].sum() > 3
 
 
+def test_a_row_of_several_steps_shows_its_goal_before_the_first_and_after_the_last() -> None:
+    sample = filled(make(n_steps=3, discount=0.9)).sample()
+    sample = sample[sample["goal", "mask"].flatten()]
+    goal, after = sample["goal", "pose"], sample["next"]
+    assert (sample["steps_to_next_obs"] == 3).any()
+    assert torch.equal(sample["pixels"], toy.render(sample["pose"], goal))
+    assert torch.equal(after["pixels"], toy.render(after["pose"], goal))
+
+
 def paint_what_is_ahead(pixels: Tensor, pose: Tensor, goal_pose: Tensor) -> Tensor:
     """The exact hallucinator for a car that sees nothing beside it or behind."""
     ahead = relative_pose(pose, goal_pose)[..., 0] > 0.5
