@@ -140,6 +140,13 @@ def always(probability: float) -> Annealing:
     return Annealing(probability, probability, 1)
 
 
+def of_three_steps(rows: TensorDict) -> TensorDict:
+    """Rows that each span three steps."""
+    index = torch.arange(len(rows))[:, None]
+    rows["hindsight", "reward"] = -0.25 - 0.125 * (index + torch.tensor([0, 3, 7])).remainder(5)
+    return rows.set("steps_to_next_obs", torch.full((len(rows),), 3))
+
+
 @dataclass(frozen=True)
 class Case:
     """A transform and what the common tests must know of it."""
@@ -152,6 +159,8 @@ class Case:
     """Which entries it sets on the sample path."""
     on_write: bool = False
     """Whether it reads when rows are written rather than sampled."""
+    prepare: Callable[[TensorDict], TensorDictBase] = TensorDict.copy
+    """Makes rows that it takes out of ``sampled_rows``."""
 
     def apply(self, transform: ReplayTransform, rows: TensorDictBase) -> TensorDictBase:
         return transform.inv(rows) if self.on_write else transform(rows)
@@ -166,6 +175,11 @@ CASES = {
             "done": (("next", "done"),),
             "terminated": (("next", "terminated"),),
         },
+        on_write=True,
+    ),
+    "StampFuturePoses(n_steps)": Case(
+        lambda **keys: StampFuturePoses(DISTANCE, n_steps=3, discount=0.5, **keys),
+        {"pose": ("pose", ("next", "pose")), "reward": (("next", "reward"),), "done": (("next", "done"),)},
         on_write=True,
     ),
     "DrawHindsightGoal": Case(
@@ -216,6 +230,25 @@ CASES = {
             "truncated": (("next", "truncated"),),
         },
         (("next", "reward"), ("next", "done"), ("next", "terminated"), ("next", "truncated")),
+    ),
+    "HindsightReward(n_steps)": Case(
+        lambda **keys: HindsightReward(n_steps=3, discount=0.5, **keys),
+        {
+            "goal": (("goal", "mask"), ("goal", "pose")),
+            "hindsight": (("hindsight", "pose"), ("hindsight", "horizon")),
+            "reward": (("next", "reward"),),
+            "truncated": (("next", "truncated"),),
+        },
+        (*((("next", name)) for name in ("reward", "done", "terminated", "truncated")), "steps_to_next_obs"),
+        prepare=of_three_steps,
+    ),
+    "HallucinateGoal, on writing": Case(
+        lambda **keys: HallucinateGoal(invert, **keys), {"pixels": ("pixels", ("next", "pixels"))}, on_write=True
+    ),
+    "HindsightReward, on writing": Case(
+        lambda **keys: HindsightReward(**keys),
+        {name: (("next", name),) for name in ("pose", "reward", "done", "terminated", "truncated")},
+        on_write=True,
     ),
 }
 SAMPLING = {name: case for name, case in CASES.items() if not case.on_write}

@@ -38,7 +38,7 @@ READS = [
 
 def rows_for(case: Case) -> TensorDictBase:
     """Rows that the transform has not seen; on the write path they must be consecutive steps."""
-    rows = sampled_rows()
+    rows = case.prepare(sampled_rows())
     if case.on_write:
         rows = rows.exclude("hindsight", "goal")
         rows["pose"] = torch.cat([rows["pose"][:1], rows["next", "pose"][:-1]])

@@ -205,6 +205,22 @@ def test_prefetched_batches_are_relabelled_without_gradients() -> None:
         assert torch.equal(sample["pixels"][mask], toy.render(sample["pose"], sample["goal", "pose"])[mask])
 
 
+def test_no_goal_crosses_an_episode_after_the_ring_has_wrapped() -> None:
+    stream = torch.cat(collect(420), dim=1)
+    episode = torch.cat([torch.zeros(3, 1), stream["next", "done"].squeeze(-1).cumsum(1)[:, :-1]], 1)
+    stream["id"] = torch.stack([torch.arange(3)[:, None].expand(3, 140), episode, torch.arange(140).expand(3, 140)], -1)
+    buffer = buffer_with(make(), storage=LazyTensorStorage(100))
+    for batch in stream.split(7, dim=1):
+        buffer.extend(batch)
+    sample = buffer.sample(500)
+    sample = sample[sample["goal", "mask"].flatten()]
+    for row in sample:
+        car, of, time = row["id"].long().tolist()
+        ahead = stream["next", "pose"][car, time : time + DISTANCE][episode[car, time : time + DISTANCE] == of]
+        assert (ahead == row["goal", "pose"]).all(1).any()
+    assert len(sample) > 300
+
+
 def test_memory_mapped_storage_gives_the_same_rows(tmp_path: Path) -> None:
     mapped = filled(make(), storage=LazyMemmapStorage(1_000, scratch_dir=tmp_path))
     assert_identical(mapped.sample(), filled(make()).sample())
