@@ -1,7 +1,7 @@
 """What rows must be so that each one's future can be read off those after it."""
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import LazyStackedTensorDict, NestedKey, TensorDictBase
 from torch import Tensor
 
 from halgan_rl.keys import dotted
@@ -16,6 +16,19 @@ def layout_of(rows: TensorDictBase) -> Layout:
     """Returns what the rows ``[..., T]`` hold."""
     dims = rows.batch_dims
     return {key: (value.dtype, value.shape[dims:]) for key, value in rows.items(True, True)}
+
+
+def dense(rows: TensorDictBase) -> TensorDictBase:
+    """Returns the rows, stacked at last if they are a lazy stack, as a collector gives them to a buffer.
+
+    A part of a lazy stack shares its rows with the whole: setting an entry on the one would set it on the other.
+    """
+    return rows.contiguous() if _is_lazy(rows) else rows
+
+
+def _is_lazy(rows: TensorDictBase) -> bool:
+    nested = (value for value in rows.values() if isinstance(value, TensorDictBase))
+    return isinstance(rows, LazyStackedTensorDict) or any(map(_is_lazy, nested))
 
 
 def check_layout(layout: Layout, waiting: list[UnfinishedEpisode]) -> None:

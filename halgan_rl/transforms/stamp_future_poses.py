@@ -16,6 +16,7 @@ from halgan_rl.transforms.consecutive_rows import (
     check_layout,
     check_reach,
     check_unpadded,
+    dense,
     layout_of,
 )
 from halgan_rl.transforms.n_step_rows import STEPS_KEY, future_rewards, n_step_rows
@@ -51,9 +52,11 @@ class StampFuturePoses(ReplayTransform):
     rewards, so that a goal may be reached at any of the steps. This is the one way to n-step returns with hindsight:
     rows that a ``MultiStepTransform`` changed, before this transform or after it, are refused.
 
-    **Environments.** What follows a terminal row must be that episode's last observation. So it is for TorchRL's
-    environments, one (``GymEnv(id)``) or several in ``SerialEnv`` or ``ParallelEnv``, collected by its collectors.
-    ``max_step`` refuses such rows.
+    **Environments.** What follows a terminal row must be the last observation of its own episode, or goals cross
+    episodes. So it is, with TorchRL's collectors, for ``GymEnv(id)``, for ``SerialEnv`` and ``ParallelEnv``, for a
+    ``TransformedEnv`` around them, and for a vectorised Gymnasium environment with ``AutoresetMode.DISABLED``. It is
+    not for ``GymEnv(id, num_envs=n)``, nor for a vectorised environment with ``AutoresetMode.SAME_STEP``: there it is
+    the next episode's first observation, or zeros (torchrl 0.14.1). Give ``max_step``, and such rows are refused.
 
     Args:
         max_distance: D, the furthest goal in steps (the paper's longest failed segment: 32 for Navigate).
@@ -97,8 +100,8 @@ class StampFuturePoses(ReplayTransform):
         max_step: float | None = None,
         n_steps: int = 1,
         discount: float | None = None,
-        poses: Poses = PlanarPoses(),  # noqa: B008 (frozen)
-        keys: Keys = Keys(),  # noqa: B008 (frozen)
+        poses: Poses = PlanarPoses(),
+        keys: Keys = Keys(),
     ) -> None:
         super().__init__(keys)
         if max_distance < 1:
@@ -209,8 +212,8 @@ class StampFuturePoses(ReplayTransform):
         self._waiting, self._before, self._flushed = waiting, None, None
 
     def _is_stamped(self, tensordict: TensorDictBase) -> bool:
-        keys = tensordict.keys(True, True)
-        return self.keys.hindsight_pose in keys and self.keys.hindsight_horizon in keys
+        keys = (self.keys.hindsight_pose, self.keys.hindsight_horizon)  # their get() knows lazy stacks, keys() does not
+        return all(tensordict.get(key, None) is not None for key in keys)
 
     def _pass(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns stamped rows as they are; refuses those of another ``max_distance``."""
@@ -241,7 +244,7 @@ class StampFuturePoses(ReplayTransform):
                 "StampFuturePoses holds rows back and cannot take them through add(): "
                 "write them with replay_buffer.extend(row.unsqueeze(0))."
             )
-        rows = tensordict.reshape(-1, tensordict.batch_size[-1])
+        rows = dense(tensordict).reshape(-1, tensordict.batch_size[-1])
         if self._waiting and len(rows) != len(self._waiting):
             raise ValueError(
                 f"These rows come from {len(rows)} environments (batch size {tuple(tensordict.batch_size)}), those "
