@@ -10,12 +10,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from torchrl.objectives import DQNLoss, LossModule, SoftUpdate
+from torch import nn
+from torchrl.objectives import DDPGLoss, DQNLoss, LossModule, SoftUpdate
 
+from halgan_rl.agents.clipped_targets import ClippedTD0Estimator
+from halgan_rl.agents.ddpg import Actor, Critic, UnsaturatedDDPGLoss, deterministic_policy
+from halgan_rl.agents.ddqn import QNetwork, greedy_policy
 from halgan_rl.agents.fast_cpu.fused_soft_update import FusedSoftUpdate
-from halgan_rl.agents.fast_cpu.one_pass_losses import OnePassDDPGLoss, OnePassDQNLoss
-from halgan_rl.agents.networks import Actor, Critic, QNetwork, deterministic_policy, greedy_policy
-from halgan_rl.agents.objectives import ClippedTD0Estimator, UnsaturatedDDPGLoss
+from halgan_rl.agents.fast_cpu.one_pass_losses import OnePassDDPGLoss, OnePassDQNLoss, share_passes
 
 
 @dataclasses.dataclass
@@ -34,27 +36,45 @@ def make_rows(shape: tuple[int, ...], action: torch.Tensor) -> TensorDict:
     return TensorDict({"pixels": pixels[0], "action": action, "next": after}, batch_size=shape)
 
 
-def ddpg(shape: tuple[int, ...] = (6,), downsample: Any = "stride", **options: Any) -> Pair:
-    actor, critic = Actor(downsample=downsample, small_output=False), Critic(downsample=downsample)
-    judge = TensorDictModule(copy.deepcopy(critic), ["pixels", "action"], ["state_action_value"])
-    policy = deterministic_policy(copy.deepcopy(actor))
-    theirs = UnsaturatedDDPGLoss(policy, judge, delay_actor=True, delay_value=True, **options)
-    return Pair(OnePassDDPGLoss(actor, critic, **options), theirs, make_rows(shape, torch.rand(*shape, 2)))
+def make_pair(make_loss: Callable[[], LossModule], rows: TensorDict) -> Pair:
+    """Returns a loss made twice, with the same parameters, one of which shares passes."""
+    ours, theirs = make_loss(), make_loss()
+    theirs.load_state_dict(ours.state_dict())
+    assert share_passes(ours)
+    assert isinstance(ours, OnePassDDPGLoss | OnePassDQNLoss)
+    return Pair(ours, theirs, rows)
+
+
+def make_ddpg_loss(actor: nn.Module, critic: nn.Module, **options: Any) -> UnsaturatedDDPGLoss:
+    judge = TensorDictModule(critic, ["pixels", "action"], ["state_action_value"])
+    return UnsaturatedDDPGLoss(deterministic_policy(actor), judge, delay_actor=True, delay_value=True, **options)
+
+
+BOUNDS = {"low": [0.0, -3.0], "high": [1.0, 5.0]}
+
+
+def ddpg(shape: tuple[int, ...] = (6,), downsample: Any = "stride", bounds: Any = None, **options: Any) -> Pair:
+    def make_loss() -> LossModule:
+        made = {"downsample": downsample, **(bounds or {})}
+        return make_ddpg_loss(Actor(small_output=False, **made), Critic(**made), **options)
+
+    return make_pair(make_loss, make_rows(shape, torch.rand(*shape, 2)))
 
 
 def dqn(shape: tuple[int, ...] = (6,), downsample: Any = "stride", double: bool = True, **options: Any) -> Pair:
-    network = QNetwork(downsample=downsample)
-    policy = greedy_policy(copy.deepcopy(network))
-    theirs = DQNLoss(policy, delay_value=True, double_dqn=double, action_space="one_hot", **options)
-    action = torch.nn.functional.one_hot(torch.randint(4, shape), 4)
-    return Pair(OnePassDQNLoss(network, double=double, **options), theirs, make_rows(shape, action))
+    def make_loss() -> LossModule:
+        policy = greedy_policy(QNetwork(downsample=downsample))
+        return DQNLoss(policy, delay_value=True, double_dqn=double, action_space="one_hot", **options)
+
+    return make_pair(make_loss, make_rows(shape, nn.functional.one_hot(torch.randint(4, shape), 4)))
 
 
 CASES: dict[str, Callable[[], Pair]] = {
     "DDPG": ddpg,
     "DDPG, pooled": lambda: ddpg(downsample="max_pool"),
     "DDPG, two batch dimensions": lambda: ddpg((2, 3)),
-    "DDPG, dear pre-activations": lambda: ddpg(preactivation_weight=1.0),
+    "DDPG, other bounds": lambda: ddpg(bounds=BOUNDS),
+    "DDPG, heavy penalty": lambda: ddpg(preactivation_weight=1.0),
     "DDPG, each row's loss": lambda: ddpg(reduction="none", loss_function="l1"),
     "DDQN": dqn,
     "DDQN, pooled": lambda: dqn(downsample="max_pool"),
@@ -66,7 +86,7 @@ CASES: dict[str, Callable[[], Pair]] = {
 
 @pytest.fixture(params=CASES)
 def pair(request: pytest.FixtureRequest) -> Pair:
-    """Losses with targets that are another network's, so that it shows who is asked."""
+    """Losses with targets that are another network's, so that it shows which one is used."""
     torch.manual_seed(0)
     made = CASES[request.param]()
     for loss in (made.ours, made.theirs):
@@ -80,7 +100,7 @@ def pair(request: pytest.FixtureRequest) -> Pair:
 
 
 def gradients(loss: LossModule, rows: TensorDict, name: str) -> dict[str, torch.Tensor]:
-    """Return the gradients of one of the losses, without those that are zero."""
+    """Returns the gradients of one of the losses, without those that are zero."""
     loss.zero_grad()
     loss(rows)[name].sum().backward()
     found = {key: parameter.grad for key, parameter in loss.named_parameters()}
@@ -116,7 +136,7 @@ def test_priority_weights_are_heeded(pair: Pair) -> None:
 
 
 def assert_heeded(pair: Pair, rows: TensorDict) -> None:
-    """Assert that both losses make the same of an entry of the rows, and not the same as without it."""
+    """Asserts that both losses make the same of an entry of the rows, and not the same as without it."""
     losses, without = pair.ours(rows.clone()), pair.ours(pair.rows.clone())
     for name, value in pair.theirs(rows).items():
         torch.testing.assert_close(losses[name], value, rtol=1e-4, atol=1e-5, msg=name)
@@ -125,7 +145,7 @@ def assert_heeded(pair: Pair, rows: TensorDict) -> None:
 
 
 def learn(loss: LossModule, updater: SoftUpdate, rows: TensorDict) -> torch.Tensor:
-    """Make three updates, big ones; return the sum of the losses after each."""
+    """Makes three updates, big ones; return the sum of the losses after each."""
     optimizer = torch.optim.SGD([parameter for parameter in loss.parameters() if parameter.requires_grad], lr=0.1)
     sums = []
     for _ in range(3):
@@ -145,7 +165,7 @@ def test_targets_follow_the_parameters(pair: Pair) -> None:
 
 
 def targets(loss: Any) -> tuple[torch.nn.Module, ...]:
-    """Return the target networks, of DDPG actor and critic."""
+    """Returns the target networks, of DDPG actor and critic."""
     target = loss._cached_networks[1]
     return target if isinstance(target, tuple) else (target,)
 
@@ -227,14 +247,37 @@ def test_one_loss_alone_leaves_zeros_where_torchrl_leaves_nothing() -> None:
     assert not any(gradient.any() for gradient in gradients if gradient is not None)
 
 
-def test_separate_losses_are_refused() -> None:
-    with pytest.raises(ValueError, match="separate_losses=True"):
-        OnePassDDPGLoss(Actor(), Critic(), separate_losses=True)
+def keep_plain() -> dict[str, LossModule]:
+    """Returns losses whose networks a shared pass would not compute as they do."""
+    exchanged, normalised = Actor(), Critic()
+    exchanged.encoder.layers[1] = nn.ReLU()
+    normalised.head.insert(1, nn.LayerNorm(32))
+    large = {"image_shape": (84, 84, 3)}
+    policy = deterministic_policy(Actor())
+    judge = TensorDictModule(Critic(), ["pixels", "action"], ["state_action_value"])
+    categorical = TensorDictModule(QNetwork(), ["pixels"], ["action_value"])
+    return {
+        "images that blocks do not divide": make_ddpg_loss(Actor(**large), Critic(**large)),
+        "another activation": make_ddpg_loss(exchanged, Critic()),
+        "a head that normalises": make_ddpg_loss(Actor(), normalised),
+        "TorchRL's own DDPG": DDPGLoss(policy, judge, delay_actor=True, delay_value=True),
+        "targets that do not lag": DQNLoss(greedy_policy(QNetwork()), delay_value=False, action_space="one_hot"),
+        "another policy": DQNLoss(copy.deepcopy(categorical), delay_value=True, action_space="one_hot"),
+    }
 
 
-def test_networks_of_different_kinds_are_refused() -> None:
-    loss = OnePassDDPGLoss(Actor(downsample="max_pool"), Critic())
+@pytest.mark.parametrize("case", keep_plain())
+def test_what_a_shared_pass_would_not_compute_stays_plain(case: str) -> None:
+    loss = keep_plain()[case]
+    kind = type(loss)
+    assert not share_passes(loss)
+    assert type(loss) is kind
+
+
+def test_networks_of_different_downsamplings_are_refused() -> None:
+    loss = make_ddpg_loss(Actor(downsample="max_pool"), Critic())
     loss.make_value_estimator(gamma=0.9)
+    share_passes(loss)
     FusedSoftUpdate(loss, tau=0.1)
     with pytest.raises(ValueError, match=r"one down-sampling, got \['max_pool', 'stride'\]"):
         loss(ddpg().rows)
