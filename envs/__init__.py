@@ -9,6 +9,9 @@ torch.Size([64, 64, 3])
 Importing it registers the Gymnasium ids of all named environments, e.g. ``halgan_rl/Navigate2m-v0``.
 """
 
+if __name__ == "envs":
+    raise ImportError("The folder envs is installed as halgan_envs: import halgan_envs.")
+
 from . import rendering  # First: it settles the OpenGL backend, which mujoco and dm_control read once.
 from .adapters.gymnasium_env import GymnasiumEnv, gymnasium_id, register_named
 from .adapters.torchrl_env import ComposerEnv, make

@@ -3,10 +3,11 @@
 from collections.abc import Iterator
 from typing import Any
 
-import halgan_envs
 import mujoco
 import numpy as np
 import pytest
+
+import halgan_envs
 
 
 class Stage:

@@ -1,10 +1,11 @@
 """After close, a reset, a step or a picture raises an error with the remedy."""
 
 import gymnasium
-import halgan_envs
 import numpy as np
 import pytest
 import torch
+
+import halgan_envs
 from halgan_envs.rendering.persistent_camera import PersistentCamera
 
 ACTION = np.array([0.5, -0.2], np.float32)

@@ -3,9 +3,10 @@
 import dataclasses
 import pickle
 
-import halgan_envs
 import numpy as np
 import pytest
+
+import halgan_envs
 
 
 @pytest.fixture(params=sorted(halgan_envs.NAMES))

@@ -4,14 +4,15 @@ import matplotlib
 
 matplotlib.use("Agg")
 
-import halgan_envs
 import numpy as np
 import pytest
+from matplotlib import pyplot as plt
+from matplotlib.backend_bases import KeyEvent
+
+import halgan_envs
 from halgan_envs import drive
 from halgan_envs.robots.rover import Rover
 from halgan_envs.robots.turtlebot import BACKWARD, FORWARD, LEFT, RIGHT, TurtleBot, motions_for
-from matplotlib import pyplot as plt
-from matplotlib.backend_bases import KeyEvent
 
 
 def held(*names):

@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import pytest
+
 from halgan_envs.rendering import gl_backend
 
 RENDER = "import halgan_envs; env = halgan_envs.make('navigate-2m', seed=0); env.reset(); env.close()"

@@ -1,11 +1,12 @@
 import warnings
 
 import gymnasium
-import halgan_envs
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from tensordict import TensorDict
+
+import halgan_envs
 
 BRAKE = np.array([-1.0, 0.0], np.float32)
 IDS = {name: halgan_envs.gymnasium_id(name) for name in halgan_envs.NAMES}

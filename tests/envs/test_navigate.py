@@ -1,8 +1,9 @@
 import time
 
-import halgan_envs
 import numpy as np
 import pytest
+
+import halgan_envs
 from halgan_envs.adapters.transition import random_action
 from halgan_envs.arenas.walled_room import WalledRoom
 from halgan_envs.props.goal_box import GoalBox

@@ -1,6 +1,7 @@
-import halgan_envs
 import numpy as np
 import pytest
+
+import halgan_envs
 from halgan_envs.near_goal import collect_failed, collect_near_goal
 
 

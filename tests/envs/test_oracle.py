@@ -1,7 +1,8 @@
-import halgan_envs
 import numpy as np
 import pytest
 import torch
+
+import halgan_envs
 
 
 @pytest.fixture(scope="module")

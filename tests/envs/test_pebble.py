@@ -1,9 +1,10 @@
-import halgan_envs
 import mujoco
 import numpy as np
 import pytest
 import torch
 from dm_control.composer import EpisodeInitializationError
+
+import halgan_envs
 from halgan_envs.adapters.transition import read
 from halgan_envs.arenas.arena import WALL_GROUP
 from halgan_envs.arenas.road import Road

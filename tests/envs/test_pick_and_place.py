@@ -1,9 +1,10 @@
 from collections.abc import Iterator
 
-import halgan_envs
 import numpy as np
 import pytest
 import torch
+
+import halgan_envs
 from halgan_envs.arenas.walled_room import WalledRoom
 from halgan_envs.near_goal import collect_failed, collect_near_goal
 from halgan_envs.props.goal_box import GREEN, GoalBox

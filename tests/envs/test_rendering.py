@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from halgan_envs.rendering.persistent_camera import PersistentCamera
 
 

@@ -1,6 +1,7 @@
-import halgan_envs
 import numpy as np
 import pytest
+
+import halgan_envs
 from halgan_envs.robots.rover import Rover, wrap_angle
 
 

@@ -1,6 +1,5 @@
 import functools
 
-import halgan_envs
 import numpy as np
 import pytest
 import torch
@@ -10,6 +9,8 @@ from torchrl.collectors import Collector
 from torchrl.envs import ParallelEnv
 from torchrl.envs.utils import check_env_specs
 from torchrl.modules import EGreedyModule, QValueActor
+
+import halgan_envs
 
 
 @pytest.fixture(scope="module")

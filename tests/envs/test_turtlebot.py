@@ -1,7 +1,8 @@
-import halgan_envs
 import mujoco
 import numpy as np
 import pytest
+
+import halgan_envs
 from halgan_envs.robots.turtlebot import (
     BACKWARD,
     BODY_GROUP,
