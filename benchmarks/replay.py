@@ -15,8 +15,8 @@ A peer and ours, at all sizes, are measured by turns on one thread. Times are me
 medians of those of each round. Samples are timed after a few that are not, for all buffers alike: the first of a
 round finds cold caches, whatever the buffer, and would draw all ratios to 1. What a sample takes right after rows
 were added has a column of its own, and so has one of sixteen that are drawn at once, as in our recipes
-(``halgan_rl.training.loop.draw_batches``). A million rows are measured with frames of 8x8 pixels, to fit; the same small
-frames show how time grows from ten thousand rows on.
+(``halgan_rl.training.loop.draw_batches``). A million rows are measured with frames of 8x8 pixels, to fit; the same
+small frames show how time grows from ten thousand rows on.
 """
 
 import dataclasses
@@ -42,7 +42,7 @@ from benchmarks.rows import EPISODE, Rows, plain
 from benchmarks.tables import Table, report
 from halgan_rl.replay.frame_storage import FrameStorage
 from halgan_rl.training.loop import AT_ONCE
-from halgan_rl.transforms import DrawHindsightGoal, HindsightReward, StampFuturePoses
+from halgan_rl.transforms import Annealing, DrawHindsightGoal, HindsightReward, StampFuturePoses
 
 ADDED, PAIRS = 16, 32
 UNTIMED = 5
@@ -159,8 +159,8 @@ def ours(rows: Rows, count: int) -> Replay:
 
 def ours_with_hindsight(rows: Rows, count: int) -> Replay:
     """Each frame once, 32 future poses a row; 80 % of a sample relabelled."""
-    generator = torch.Generator().manual_seed(0)
-    hindsight = Compose(StampFuturePoses(32), DrawHindsightGoal(0.8, 0.8, generator=generator), HindsightReward())
+    draw = DrawHindsightGoal(Annealing(0.8, 0.8, 1), rng=torch.Generator().manual_seed(0))
+    hindsight = Compose(StampFuturePoses(32), draw, HindsightReward())
     buffer = TensorDictReplayBuffer(storage=FrameStorage(count), batch_size=PAIRS, transform=hindsight)
     return on_torchrl(buffer, lambda part: part, rows, count)
 

@@ -108,7 +108,7 @@ class HallucinateGoal(ReplayTransform):
                     "them before they are scaled, without ToTensorImage, or convert: (255 * pixels).round().byte()."
                 )
             shapes.append(tuple(pixels.shape[rows.batch_dims :]))
-            check_image_shape(shapes[-1], name, self.image_shape)
+            _check_image_shape(shapes[-1], name, self.image_shape)
         if shapes[0] != shapes[1]:
             raise ValueError(f"{name} has images {shapes[1]}, but {dotted(self.keys.pixels)} has {shapes[0]}.")
 
@@ -171,7 +171,7 @@ class HallucinateGoal(ReplayTransform):
         return edited[:, 0], edited[:, 1]
 
 
-def check_image_shape(shape: tuple[int, ...], name: str, wanted: tuple[int, ...] | None = None) -> None:
+def _check_image_shape(shape: tuple[int, ...], name: str, wanted: tuple[int, ...] | None = None) -> None:
     """Refuses what is no image ``[H, W, C]``.
 
     Args:
