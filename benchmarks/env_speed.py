@@ -5,8 +5,9 @@ Usage: python -m benchmarks.env_speed [--names navigate-2m pebble] [--steps 500]
 Every measurement runs in a process of its own (OpenGL contexts of different kinds do not mix), the variants by turns,
 so that what else the machine does falls on all of them. The table shows medians, by wall time and by processor time,
 which a busy machine distorts less; the ratios are of processor time. MiniWorld's OneRoom, another simulator's room with
-a red box, stands beside navigate-2m, and so does our Gymnasium face, which is its interface. Composer environments and
-the TorchRL face are handed actions that were drawn before; TorchRL's rollout and Gymnasium's environments draw theirs.
+a red box, is measured beside navigate-2m, and so is our Gymnasium adapter, which has its interface. Composer
+environments and the TorchRL adapter take actions that were drawn before; TorchRL's rollout and Gymnasium's
+environments draw theirs.
 """
 
 import argparse
@@ -19,13 +20,15 @@ from collections.abc import Callable
 from functools import partial
 
 import gymnasium
-import halgan_envs
 import numpy as np
 import torch
+
+import halgan_envs
+from benchmarks.tables import Table, report
 from halgan_envs.adapters.transition import random_action
 from halgan_envs.environment import Environment
-
-from benchmarks.tables import Table, report
+from halgan_envs.rendering.gl_backend import VARIABLE
+from halgan_envs.rendering.persistent_camera import BACKEND
 
 
 def bare_renderer(name: str, steps: int) -> Callable[[], None]:
@@ -40,7 +43,7 @@ def composer(name: str, steps: int) -> Callable[[], None]:
     return stepping(halgan_envs.named(name)(random_state=0), steps)
 
 
-def torchrl_face(name: str, steps: int) -> Callable[[], None]:
+def torchrl_adapter(name: str, steps: int) -> Callable[[], None]:
     """The TorchRL environment with random actions, resets included."""
     env = halgan_envs.make(name, seed=0)
     actions = [env.action_spec.rand() for _ in range(steps)]
@@ -72,7 +75,7 @@ def stock_camera(name: str, steps: int) -> Callable[[], None]:
     return stepping(Environment(task, time_limit=20.0, random_state=0), steps)
 
 
-def gymnasium_face(name: str, steps: int) -> Callable[[], None]:
+def gymnasium_adapter(name: str, steps: int) -> Callable[[], None]:
     """The Gymnasium environment, with random actions."""
     return stepping_gymnasium(gymnasium.make(halgan_envs.gymnasium_id(name)), steps)
 
@@ -92,11 +95,11 @@ TASKS = ("navigate-2m", "pick-and-place-2m", "pebble")
 VARIANTS = {
     "bare renderer": bare_renderer,
     "ours, composer": composer,
-    "ours, TorchRL": torchrl_face,
+    "ours, TorchRL": torchrl_adapter,
     "ours, TorchRL, rollout": torchrl_rollout,
     "stock composer camera": stock_camera,
 }
-ALL_VARIANTS = VARIANTS | {"ours, Gymnasium": gymnasium_face, "MiniWorld OneRoom, Gymnasium": miniworld}
+ALL_VARIANTS = VARIANTS | {"ours, Gymnasium": gymnasium_adapter, "MiniWorld OneRoom, Gymnasium": miniworld}
 """What navigate-2m, the room that is most like MiniWorld's, is measured with."""
 
 
@@ -173,7 +176,7 @@ def make_table(name: str, results: dict[str, list[tuple[float, float]]]) -> Tabl
     """Return medians, spread, and the ratio to the stock camera."""
     wall = {variant: [value[0] for value in values] for variant, values in results.items()}
     processor = {variant: statistics.median(value[1] for value in values) for variant, values in results.items()}
-    title = f"{name}, 64x64 pixels, {halgan_envs.rendering.gl_backend.VARIABLE}={halgan_envs.fingerprint(name)['gl']}, one process"
+    title = f"{name}, 64x64 pixels, {VARIABLE}={BACKEND}, one process"
     header = ("variant", "steps/s", "lowest to highest", "steps per processor second", "ratio to stock")
     lines = []
     for variant, values in wall.items():

@@ -1,4 +1,4 @@
-"""Simulated rooms in which a robot looks for its goal; knows no learning.
+"""Simulated rooms in which a robot must find a goal by sight; nothing here learns.
 
 >>> import halgan_envs
 >>> env = halgan_envs.make("navigate-2m", seed=0)
@@ -6,7 +6,7 @@
 torch.Size([64, 64, 3])
 >>> env.close()
 
-Importing it registers the Gymnasium ids of all named environments, e.g. ``halgan_rl/Navigate2m-v0``.
+The import registers the Gymnasium ids of all named environments, e.g. ``halgan_rl/Navigate2m-v0``.
 """
 
 if __name__ == "envs":

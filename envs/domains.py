@@ -20,7 +20,8 @@ def domain(name: str) -> Domain:
     """Returns all that a run must know of a named environment, built once in a process.
 
     The first call compiles one environment, that of the goal renderer: flags, goal offsets, action spec and golden
-    frame are read from it. The domain pickles; a child process that uses its goal renderer builds its own.
+    frame are read from it. With EGL that renderer belongs to the thread of the first call. The domain pickles; a child
+    process that uses its goal renderer builds its own.
 
     Args:
         name: One of ``halgan_envs.NAMES``.

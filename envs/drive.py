@@ -12,7 +12,7 @@ from .suite.names import named
 
 
 class ArrowKeys:
-    """Which keys are held down, by matplotlib's key events, and what the arrows ask of the robot."""
+    """The keys that are held down, by matplotlib's key events, and the action that the arrows stand for."""
 
     def __init__(self) -> None:
         self._held: set[str] = set()
@@ -26,21 +26,21 @@ class ArrowKeys:
         self._held.discard(event.key)
 
     def action(self, robot: Any) -> Any:
-        """An action: up and down drive at full speed, left and right turn at the full rate, no key stands still.
+        """Returns an action: up and down drive at full speed, left and right turn at the full rate, no key is a halt.
 
-        Without a reverse gear, down stands still too.
+        Without a reverse gear, down is a halt too.
 
         Args:
-            robot: Who acts.
+            robot: The robot that acts.
 
         Returns:
-            The action; None if the keys ask to stand still and the robot has no action that does.
+            The action; None if the keys mean a halt and the robot has no action for it.
         """
         forward, turn = self._axis("up", "down"), self._axis("left", "right")
         speed = forward * (robot.max_speed if forward > 0 else robot.reverse_speed)
         action = robot.action_for(speed, turn * robot.max_turn_rate)
-        stands_still = np.allclose(robot.velocities(action), 0.0)
-        return action if speed or turn or stands_still else None
+        halts = np.allclose(robot.velocities(action), 0.0)
+        return action if speed or turn or halts else None
 
     def _axis(self, positive: str, negative: str) -> int:
         return (positive in self._held) - (negative in self._held)
@@ -60,7 +60,7 @@ class Cockpit:
     def tick(self) -> None:
         """Takes a step, or starts the next episode after an end, and shows where it led.
 
-        A robot that cannot stand still waits for a key.
+        A robot that cannot halt waits for a key.
         """
         task = self._environment.task
         action = self._keys.action(task.robot)
@@ -78,7 +78,7 @@ class Cockpit:
 
 
 def main(environment: str = "navigate-2m") -> None:
-    """Drive a robot with the arrow keys until the window is closed; environment is one of ``halgan_envs.NAMES``."""
+    """Drives a robot with the arrow keys until the window is closed; environment is one of ``halgan_envs.NAMES``."""
     # Free the arrow keys, which matplotlib takes for back and forward in the history of views.
     plt.rcParams.update({"keymap.back": [], "keymap.forward": []})
     room = named(environment)()

@@ -1,8 +1,8 @@
 """Snapshots near the goal and away from it, for training a hallucinator.
 
 The near-goal ones come from a scripted controller with *privileged* access: it reads the goal's position from the
-simulator, which no agent may. It stands in for a person who drives the robot to the goal a few dozen times (Sahni et
-al., NeurIPS 2019, section 4); every episode ends in a real success, and no image is picked by hand.
+simulator, which no agent may do. It replaces a person who drives the robot to the goal a few dozen times (Sahni et al.,
+NeurIPS 2019, section 4). Every episode ends in a real success, and no image is picked by hand.
 """
 
 from collections import deque
@@ -18,9 +18,9 @@ from .tasks.goal import Goal, in_robot_frame
 _CALM_DISTANCE = 2.5
 """Farther from the goal than this, in units of the goal's offset, the driver wanders little."""
 _FAR_NOISE = 0.2
-"""Share of random actions there."""
+"""Fraction of random actions there."""
 _NOISE = (0.6, 1.0)
-"""Lowest and highest share of random actions near the goal: the snippets that hindsight relabels are wandering ones."""
+"""Lowest and highest fraction of random actions near the goal: the segments that hindsight relabels wander too."""
 _HOLD = 8
 """Steps that a random action of a failed episode lasts."""
 
@@ -35,7 +35,7 @@ class NoisyDriver:
     Args:
         environment: Where it drives.
         random_state: Source of all its noise.
-        noise: Lowest and highest share of random actions near the goal.
+        noise: Lowest and highest fraction of random actions near the goal.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class NoisyDriver:
         self._noise = self._random_state.uniform(*self._range)
 
     def act(self, pose: np.ndarray) -> Any:
-        """An action for a robot at pose [P]."""
+        """Returns an action for a robot at pose [P]."""
         task = self._environment.task
         ahead, left = in_robot_frame(pose, task.goal_position(self._environment.physics))
         goal = task.goal(pose)
@@ -87,15 +87,15 @@ def collect_near_goal(
 ) -> dict[str, np.ndarray]:
     """Collects the last states before each goal of successful rollouts of the privileged driver.
 
-    The flags of a pose tell which goal its image shows near. Where flags change within a rollout, as at a pick-up, one
-    goal is reached and the next begins: each goal gives about as many snapshots.
+    The flags of a pose select the goal that its image shows from near. Where flags change within a rollout, as at a
+    pick-up, one goal is reached and the next is pursued: each goal gives about as many snapshots.
 
     Args:
         environment: Where to drive; ends up mid-episode.
         count: Number of snapshots N.
         random_state: Source of the driver's noise; the starts are the environment's own.
         steps_before_goal: States kept of the way to each goal besides its last one.
-        noise: Lowest and highest share of random actions near the goal.
+        noise: Lowest and highest fraction of random actions near the goal.
 
     Returns:
         ``pixels`` uint8 [N, H, W, 3], ``pose`` float32 [N, P], and ``goal_pose`` float32 [N, P]: where the robot stood
@@ -129,8 +129,8 @@ def collect_failed(environment: Environment, count: int, random_state: np.random
     """Collects snapshots of episodes with uniformly random actions that do not succeed.
 
     Each action is held for a while: turns that are drawn anew at each step average out, and all walks end at a wall.
-    The goal may be in view: nobody looks. A task with several goals gives as many snapshots of walks that start with
-    the one as of walks that start with the other, in this order.
+    The goal may be in view; no image is left out for it. A task with several goals gives as many snapshots of walks
+    that start with the one as of walks that start with the other, in this order.
 
     Args:
         environment: Where to wander; ends up mid-episode.
@@ -155,7 +155,7 @@ def collect_failed(environment: Environment, count: int, random_state: np.random
 
 
 def _drive(environment: Environment, driver: NoisyDriver, keep: int) -> tuple[list[Any], bool]:
-    """One rollout: the last snapshots before each goal it reached, with its goal pose, and whether it succeeded."""
+    """Returns the last snapshots before each goal that a rollout reached, with goal poses, and whether it succeeded."""
     driver.start_episode()
     timestep = environment.reset()
     way = deque([_snapshot(timestep)], maxlen=keep)

@@ -23,7 +23,7 @@ class KnownSpec(observable.Observable):
 
     @property
     def array_spec(self) -> specs.Array:
-        """Shape, dtype and bounds."""
+        """Shape, dtype and bounds of the array."""
         return self._spec
 
     def _callable(self, physics: Any) -> Callable[[], np.ndarray]:

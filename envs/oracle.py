@@ -1,4 +1,4 @@
-"""GoalRenderer: the simulator as a hallucinator, whose pictures no generative model can beat."""
+"""GoalRenderer: the simulator as a hallucinator, the upper bound for generative models."""
 
 from collections.abc import Sequence
 
@@ -13,12 +13,11 @@ from .suite.names import named
 
 
 class GoalRenderer:
-    """Adds the goal to images, had it been where hindsight puts it.
+    """Adds the goal to images, as if it had been where hindsight puts it.
 
-    A hallucinator by its call signature: it keeps the pixels that it is given but for those of the goal, which it
-    renders in a physics of its own. Which goal that is, the flags of each image's pose tell. Walls hide no goal: most
-    random walks end at a wall, and hindsight then puts the goal into it. Like every OpenGL context this one belongs to
-    the thread that renders first (with EGL).
+    Its call is that of a hallucinator. Only the pixels of the goal change; they are rendered in a physics of its own.
+    The flags of each image's pose select the goal. Walls hide no goal: most random walks end at a wall, and hindsight
+    then puts the goal into it. As every OpenGL context this one belongs to the thread that makes it (with EGL).
 
     Args:
         environment: Name of an environment, or one (then owned and closed by this renderer).
@@ -72,7 +71,7 @@ class GoalRenderer:
         np.copyto(image, with_goal, where=(with_goal != without).any(-1, keepdims=True))
 
     def goal_position(self, pose: np.ndarray, goal_pose: np.ndarray) -> np.ndarray:
-        """Where the goal stands, x, y [m], that a robot at pose [P] pursues and will have reached at goal_pose [P]."""
+        """Returns where the goal is, x, y [m], that a robot pursues at pose [P] and reaches at goal_pose [P]."""
         x, y, yaw = goal_pose[:3]
         offset = self._task.goal(pose).offset
         return np.array([x + offset * np.cos(yaw), y + offset * np.sin(yaw)])

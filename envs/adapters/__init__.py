@@ -1,1 +1,1 @@
-"""The environments as TorchRL and Gymnasium environments."""
+"""Adapters: the environments as TorchRL and as Gymnasium environments."""

@@ -1,4 +1,4 @@
-"""GymnasiumEnv: the Gymnasium face of the named environments, and their ids."""
+"""GymnasiumEnv: the Gymnasium adapter of the named environments, and their ids."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ class GymnasiumEnv(gymnasium.Env[dict[str, Any], Any]):
     Observations are a dict of ``pixels`` uint8 [64, 64, 3] and ``pose`` float32 [P] (x [m], y [m], yaw [rad], then the
     flags of the task), actions float32 [2] in [-1, 1]: forward speed and turn rate; or integers where they are
     discrete. Success terminates and sets ``is_success`` in the info; the environment's own time limit truncates. An
-    episode equals that of the TorchRL face with the same seed.
+    episode equals that of the TorchRL adapter with the same seed.
 
     An OpenGL context lives in one process and, with EGL, on one thread: spawn the workers of vectorised environments,
     ``gymnasium.make_vec(..., vectorization_mode="async", vector_kwargs={"context": "spawn"})``.
@@ -48,7 +48,7 @@ class GymnasiumEnv(gymnasium.Env[dict[str, Any], Any]):
         """Starts an episode.
 
         Args:
-            seed: Of this and all later starts; None goes on with the ones before.
+            seed: Of this and all later starts; None continues the series of starts.
             options: Fixes the start, see the ``fix_start`` of the task: in Navigate any of ``pose``, the robot's x [m],
                 y [m], yaw [rad], and ``box``, its x [m], y [m]. What is not given is drawn.
 
@@ -94,7 +94,7 @@ class GymnasiumEnv(gymnasium.Env[dict[str, Any], Any]):
 
 
 def gymnasium_id(name: str) -> str:
-    """The Gymnasium id of a named environment.
+    """Returns the Gymnasium id of a named environment.
 
     >>> gymnasium_id("navigate-2m")
     'halgan_rl/Navigate2m-v0'

@@ -1,4 +1,4 @@
-"""What a reset or a step of an environment yields, in the words that its TorchRL and Gymnasium faces share."""
+"""What a reset or a step of an environment yields, as its TorchRL and Gymnasium adapters read it."""
 
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ class Transition(NamedTuple):
     pose: np.ndarray
     """float32 [P]: x [m], y [m], yaw [rad], then the flags of the task."""
     reward: float
-    """Of the step; 0 after a reset."""
+    """Reward of the step; 0 after a reset."""
     terminated: bool
     """Whether the goal is reached."""
     truncated: bool
@@ -54,7 +54,7 @@ def advance(environment: Environment, action: np.ndarray) -> Transition:
 
 
 def checked_action(action: np.ndarray) -> np.ndarray:
-    """An action [2] clipped to [-1, 1].
+    """Returns an action [2] clipped to [-1, 1].
 
     Raises:
         ValueError: if there are not two entries, or one is not a number, or out of range by more than rounding.
@@ -71,7 +71,7 @@ def checked_action(action: np.ndarray) -> np.ndarray:
 
 
 def checked_choice(action: np.ndarray, count: int) -> int:
-    """The number of one of so many discrete actions.
+    """Returns the number of one of so many discrete actions.
 
     Args:
         action: An integer without dimensions.
@@ -89,7 +89,7 @@ def checked_choice(action: np.ndarray, count: int) -> int:
 
 
 def random_action(spec: specs.Array, random_state: np.random.RandomState) -> Any:
-    """A uniformly random action: the number of a discrete one, else [2] in [-1, 1]."""
+    """Returns a uniformly random action: the number of a discrete one, else [2] in [-1, 1]."""
     if isinstance(spec, specs.DiscreteArray):
         return random_state.randint(spec.num_values)
     return random_state.uniform(spec.minimum, spec.maximum, size=spec.shape)

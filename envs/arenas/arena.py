@@ -1,4 +1,4 @@
-"""Arena: what all places share in which a robot looks for its goal."""
+"""Arena: what all places have in common in which a robot must find its goal."""
 
 import numpy as np
 from dm_control import composer

@@ -23,7 +23,7 @@ _ORANGE, _WHITE = [0.92, 0.42, 0.10, 1], [0.90, 0.90, 0.88, 1]
 class Road(Arena):
     """A road along x with kerbs that no robot climbs, pavements, barriers at both ends, cones, crates and bins.
 
-    What stands around is drawn from a seed when the model is built and never moves. Everything solid keeps the
+    The clutter is drawn from a seed when the model is built and never moves. Everything solid keeps the
     drivable rectangle free: its ends are at ``x = -length / 2`` and ``length / 2``, its kerbs at ``y = -width / 2`` and
     ``width / 2``. Two street lamps of different strength light it unevenly; nothing casts shadows.
 
@@ -57,7 +57,7 @@ class Road(Arena):
         root = self._mjcf_root
         root.visual.headlight.set_attributes(ambient=[0.38] * 3, diffuse=[0.10] * 3, specular=[0.0] * 3)
         root.visual.map.set_attributes(znear=0.01, zfar=30)
-        # Lights are computed at vertices: large faces need some, small round things few.
+        # Lights are computed at vertices: large planes need some, small round things few.
         root.visual.quality.set_attributes(numquads=8, numslices=16, numstacks=8)
         root.statistic.set_attributes(extent=1.0, center=[0, 0, 0])
         root.worldbody.add(
@@ -167,7 +167,7 @@ class Road(Arena):
         )  # fmt: skip
 
     def _solid(self, name: str, size: list[float], pos: list[float], facing: list[int], material: Any) -> None:
-        # A box whose picture is on the side that faces the road: width, height and depth in that view.
+        # A box whose picture is on the side towards the road: width, height and depth in that view.
         self._mjcf_root.worldbody.add(
             "geom", name=name, type="box", size=size, pos=pos, xyaxes=_upright(facing), material=material,
             group=WALL_GROUP, **CONTACT,

@@ -7,11 +7,11 @@ import numpy as np
 from dm_control import mjcf
 
 _GREY = 0.36
-"""Of asphalt, before everything that happened to it."""
+"""Colour of asphalt without stains and marks."""
 
 
 def png_asset(image: np.ndarray) -> Any:
-    """An image as a file that MJCF textures can name.
+    """Returns an image as a file that MJCF textures can name.
 
     Args:
         image: Colours in [0, 1], float [H, W, 3].
@@ -21,7 +21,7 @@ def png_asset(image: np.ndarray) -> Any:
 
 
 def asphalt(size: tuple[float, float], road: tuple[float, float], random_state: np.random.RandomState) -> np.ndarray:
-    """A used road from above: stains, patches, cracks, worn wheel tracks and lane marks.
+    """Returns a used road from above: stains, patches, cracks, worn wheel tracks and lane marks.
 
     Args:
         size: Of the whole ground in x and y [m]; the road runs along x through its middle.
@@ -47,7 +47,7 @@ def asphalt(size: tuple[float, float], road: tuple[float, float], random_state: 
 
 
 def bricks(colour: tuple[float, ...], mortar: float, random_state: np.random.RandomState) -> np.ndarray:
-    """Eight courses of bricks of slightly different colour, float [128, 128, 3].
+    """Returns eight courses of bricks of slightly different colour, float [128, 128, 3].
 
     Args:
         colour: Of a brick.
@@ -64,7 +64,7 @@ def bricks(colour: tuple[float, ...], mortar: float, random_state: np.random.Ran
 
 
 def planks(colour: tuple[float, ...], random_state: np.random.RandomState) -> np.ndarray:
-    """Four boards with grain, float [64, 64, 3]."""
+    """Returns four boards with grain, float [64, 64, 3]."""
     shade = random_state.uniform(0.8, 1.1, size=4)[np.arange(64) // 16][:, None] * np.ones(64)
     shade *= 1 + 0.25 * _smooth_noise((64, 64), 12, random_state)
     shade[np.arange(64) % 16 == 0] *= 0.5
@@ -72,13 +72,13 @@ def planks(colour: tuple[float, ...], random_state: np.random.RandomState) -> np
 
 
 def leaves(colour: tuple[float, ...], random_state: np.random.RandomState) -> np.ndarray:
-    """A hedge, float [128, 128, 3]."""
+    """Returns a hedge, float [128, 128, 3]."""
     shade = 1 + 0.6 * _smooth_noise((128, 128), 20, random_state) + 0.6 * _smooth_noise((128, 128), 60, random_state)
     return shade[..., None] * np.array(colour)
 
 
 def stripes(one: tuple[float, ...], other: tuple[float, ...]) -> np.ndarray:
-    """Slanted stripes of two colours, as on a barrier, float [64, 64, 3]."""
+    """Returns slanted stripes of two colours, as on a barrier, float [64, 64, 3]."""
     rows, columns = np.mgrid[:64, :64]
     return np.where(((rows + columns) % 64 < 32)[..., None], one, other)
 

@@ -1,4 +1,4 @@
-"""WalledRoom: a square room whose walls tell the directions apart."""
+"""WalledRoom: a square room with a wall of another colour in each direction."""
 
 from typing import Any
 

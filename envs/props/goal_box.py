@@ -13,7 +13,7 @@ GREEN = (0.05, 0.62, 0.10, 1.0)
 
 
 class GoalBox(MocapProp):
-    """A coloured cube that stands on the floor and cannot be pushed: a mocap body, moved through physics only.
+    """A coloured cube on the floor that cannot be pushed: a mocap body, moved through physics only.
 
     Args:
         size: Edge length [m].
@@ -36,7 +36,7 @@ class GoalBox(MocapProp):
 
     @property
     def radius(self) -> float:
-        """Of the circle around its footprint [m]."""
+        """Radius of the circle around the footprint [m]."""
         return float(self.size / np.sqrt(2))
 
     def after_compile(self, physics: Any, random_state: np.random.RandomState) -> None:

@@ -18,7 +18,7 @@ class MocapProp(composer.Entity):
 
     @property
     def radius(self) -> float:
-        """Of a circle around its footprint [m]."""
+        """Radius of a circle around the footprint [m]."""
         raise NotImplementedError
 
     @property
@@ -32,7 +32,7 @@ class MocapProp(composer.Entity):
         self._mocap = int(physics.model.ptr.body(self._mjcf_root.full_identifier).mocapid[0])
 
     def position(self, physics: Any) -> np.ndarray:
-        """Of its centre: x, y [m], float64 [2], in the world frame."""
+        """Returns where its centre is: x, y [m], float64 [2], in the world frame."""
         return physics.data.ptr.mocap_pos[self._mocap, :2].copy()
 
     def set_position(self, physics: Any, position: np.ndarray, *, yaw: float = 0.0, height: float = 0.0) -> None:

@@ -40,5 +40,5 @@ class Pebble(MocapProp):
 
     @property
     def radius(self) -> float:
-        """Of a circle around its footprint [m]."""
+        """Radius of a circle around the footprint [m]."""
         return 0.55 * self.size

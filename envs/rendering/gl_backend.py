@@ -147,13 +147,13 @@ def check_loaded(failure: Callable[[str], str | None] = failure_of) -> None:
 
 
 def _readable(reason: str) -> str:
-    # PyOpenGL stands None for a library that it does not find.
+    # In PyOpenGL a library that is not found is None.
     hint = " (PyOpenGL finds no such library)" if "'NoneType' object has no attribute" in reason else ""
     return reason.strip().rstrip(".") + hint
 
 
 def _remedy(reasons: dict[str, str]) -> str:
-    """Returns what mends backends that fail for these reasons: variables that stand in the way, else a package."""
+    """Returns what mends backends that fail for these reasons: the variable that excludes them, else a package."""
     platform, device = os.environ.get(PLATFORM, ""), os.environ.get(DEVICE)
     if platform and any(PLATFORM in reason for reason in reasons.values()):
         return f"unset {PLATFORM}, now {platform!r}"

@@ -20,7 +20,7 @@ class PersistentCamera:
 
     ``physics.render`` builds an ``MjvScene`` a frame. This camera builds scene and context once. The context is
     dm_control's, which frees itself before the process ends; :meth:`close` frees it earlier. As every OpenGL context
-    it belongs to the thread that renders first (with EGL).
+    it belongs to the thread that makes it (with EGL).
 
     Args:
         physics: A dm_control physics; the camera dies with its model.

@@ -34,7 +34,7 @@ class Rover(SightedRobot):
         name: Name of the entity.
 
     Raises:
-        ValueError: if speeds are out of order, or the body would stand in its own view.
+        ValueError: if speeds are out of order, or the body would be in its own view.
     """
 
     def _build(
@@ -117,24 +117,24 @@ class Rover(SightedRobot):
         self._open_camera(physics)
 
     def apply_action(self, physics: Any, action: np.ndarray, random_state: np.random.RandomState) -> None:
-        """Sets the servos to what :meth:`velocities` tells."""
+        """Sets the servos to the :meth:`velocities` of an action."""
         del random_state
         speed, turn_rate = self.velocities(action)
         physics.data.ptr.ctrl[self._ctrl] = speed, 0.0, turn_rate
 
     def velocities(self, action: np.ndarray) -> tuple[float, float]:
-        """What an action [2] in [-1, 1] asks for: forward speed [m/s] and turn rate [rad/s], both linear in it."""
+        """Returns forward speed [m/s] and turn rate [rad/s] of an action [2] in [-1, 1], both linear in it."""
         throttle = (float(action[0]) + 1) / 2
         speed = throttle * self.max_speed - (1 - throttle) * self.reverse_speed
         return speed, float(action[1]) * self.max_turn_rate
 
     def action_for(self, speed: float, turn_rate: float) -> np.ndarray:
-        """The action [2] that asks for a forward speed [m/s] and a turn rate [rad/s], the nearest there is."""
+        """Returns the action [2] nearest to a forward speed [m/s] and a turn rate [rad/s]."""
         forward = 2 * (speed + self.reverse_speed) / (self.max_speed + self.reverse_speed) - 1
         return np.clip([forward, turn_rate / self.max_turn_rate], -1.0, 1.0)
 
     def pose(self, physics: Any) -> np.ndarray:
-        """Where the robot is: x [m], y [m], yaw [rad] in (-pi, pi], float64 [3], in the world frame."""
+        """Returns where the robot is: x [m], y [m], yaw [rad] in (-pi, pi], float64 [3], in the world frame."""
         pose = physics.data.ptr.qpos[self._qpos].copy()
         pose[2] = wrap_angle(pose[2])
         return pose
@@ -146,7 +146,7 @@ class Rover(SightedRobot):
 
 
 def wrap_angle(angle: float) -> float:
-    """An angle [rad] in (-pi, pi].
+    """Returns an angle [rad] in (-pi, pi].
 
     >>> round(wrap_angle(1.5 * np.pi) / np.pi, 6)
     -0.5

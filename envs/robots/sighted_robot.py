@@ -1,4 +1,4 @@
-"""SightedRobot: what all robots share that see through one egocentric camera."""
+"""SightedRobot: what all robots have in common that see through one egocentric camera."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""TurtleBot: a TurtleBot2-like robot that rolls on two driven wheels, told where to go by a few discrete actions."""
+"""TurtleBot: a TurtleBot2-like robot that rolls on two driven wheels, driven by a few discrete actions."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,10 +12,10 @@ from .rover import wrap_angle
 from .sighted_robot import HIDDEN, SightedRobot
 
 BODY_GROUP = 2
-"""Group of all of the robot that can be seen; its own camera leaves it out, since it would see nothing of it."""
+"""Group of all of the robot that can be seen; its own camera leaves it out, since nothing of it is in view."""
 
 RADIUS = 0.177
-"""Of the round base [m]; this and the following are those of a Kobuki base, which a TurtleBot2 is built on."""
+"""Radius of the round base [m]; this and the following are those of a Kobuki base, which a TurtleBot2 is built on."""
 WHEEL_RADIUS = 0.038
 """[m]."""
 WHEEL_BASE = 0.23
@@ -34,14 +34,14 @@ _PLATE_RADIUS = 0.15
 _CENTRE_OF_MASS = 0.1
 
 _MAX_TORQUE = 0.5
-"""Of a wheel's servo [N m]: less than makes the wheels slip, so they stall where the robot cannot go on."""
+"""Largest torque of a wheel's servo [N m]: too little for a slip, so wheels stall where the robot cannot go on."""
 _SERVO_GAIN = 0.12
 """Torque for each rad/s that a wheel is too slow [N m s]: gets up to speed within about 0.1 s."""
 
 _ARMATURE = 0.001
-"""Of a motor, behind its gear [kg m^2]; keeps the light wheels from spinning when they start."""
+"""Inertia of a motor, behind its gear [kg m^2]; keeps the light wheels from spinning when they start."""
 _SINK = 3e-5
-"""How deep the wheels stand in the ground at rest [m]."""
+"""How deep the wheels are in the ground at rest [m]."""
 
 _BUMPER = {"condim": 3, "friction": [0.2, 0.005, 0.0001]}
 """The base touches with a little friction: stalled wheels would let it pivot freely at what it runs into."""
@@ -194,18 +194,18 @@ class TurtleBot(SightedRobot):
         physics.data.ptr.ctrl[self._ctrl] = wheel_speeds(*self.velocities(action))
 
     def velocities(self, action: int) -> tuple[float, float]:
-        """What an action asks for: forward speed [m/s] and turn rate [rad/s]."""
+        """Returns the forward speed [m/s] and the turn rate [rad/s] that an action commands."""
         speed, turn_rate = self.motions[action]
         return float(speed), float(turn_rate)
 
     def action_for(self, speed: float, turn_rate: float) -> int:
-        """The action nearest to a forward speed [m/s] and a turn rate [rad/s], in units of the fastest ones."""
+        """Returns the action nearest to a forward speed [m/s] and a turn rate [rad/s], in units of the fastest ones."""
         fastest = self.max_speed, self.max_turn_rate
-        wish = np.clip(np.divide([speed, turn_rate], fastest), -1.0, 1.0)
-        return int(np.square(self.motions / fastest - wish).sum(axis=1).argmin())
+        wanted = np.clip(np.divide([speed, turn_rate], fastest), -1.0, 1.0)
+        return int(np.square(self.motions / fastest - wanted).sum(axis=1).argmin())
 
     def pose(self, physics: Any) -> np.ndarray:
-        """Where the robot is: x [m], y [m], yaw [rad] in (-pi, pi], float64 [3], in the world frame."""
+        """Returns where the robot is: x [m], y [m], yaw [rad] in (-pi, pi], float64 [3], in the world frame."""
         x, y, _, w, i, j, k = physics.data.ptr.qpos[self._qpos]
         return np.array([x, y, wrap_angle(np.arctan2(2 * (w * k + i * j), 1 - 2 * (j * j + k * k)))])
 
@@ -218,7 +218,7 @@ class TurtleBot(SightedRobot):
 
 
 def motions_for(reverse_speed: float = 0.0) -> tuple[tuple[float, float], ...]:
-    """``MOTIONS``, or for a robot with a reverse gear the same with backward in place of driving fast.
+    """Returns ``MOTIONS``, or for a robot with a reverse gear the same with backward in place of driving fast.
 
     Args:
         reverse_speed: Of the reverse gear [m/s]; 0: none.
@@ -235,7 +235,7 @@ def motions_for(reverse_speed: float = 0.0) -> tuple[tuple[float, float], ...]:
 
 
 def wheel_speeds(speed: float, turn_rate: float) -> np.ndarray:
-    """Speeds of the left and the right wheel [rad/s], [2], at a forward speed [m/s] and a turn rate [rad/s].
+    """Returns the speeds of left and right wheel [rad/s], [2], at a forward speed [m/s] and a turn rate [rad/s].
 
     >>> wheel_speeds(0.38, 0.0).round(6).tolist()
     [10.0, 10.0]

@@ -12,7 +12,7 @@ from ..tasks.navigate import Navigate
 def navigate_4m(
     random_state: int | np.random.RandomState | None = None, time_limit: float = 20.0, reverse_speed: float = 0.0
 ) -> Environment:
-    """The paper's room (Sahni et al., NeurIPS 2019): 4 m, start at least 1 m from the box, centre it within 1 cm.
+    """Builds the paper's room (Sahni et al., NeurIPS 2019): 4 m, starts at least 1 m from the box, centred within 1 cm.
 
     Args:
         random_state: Seed or generator of the starts.
@@ -35,7 +35,7 @@ def navigate_4m(
 def navigate_2m(
     random_state: int | np.random.RandomState | None = None, time_limit: float = 20.0, reverse_speed: float = 0.0
 ) -> Environment:
-    """Half the room and half the start distance, 2 m and 0.5 m: learned in minutes.
+    """Builds half the room with half the start distance, 2 m and 0.5 m: learned in minutes.
 
     Args:
         random_state: Seed or generator of the starts.

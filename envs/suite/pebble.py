@@ -12,9 +12,9 @@ from ..tasks.pebble import FindPebble
 def find_pebble(
     random_state: int | np.random.RandomState | None = None, time_limit: float = 25.0, reverse_speed: float = 0.0
 ) -> Environment:
-    """The paper's TurtleBot task (Sahni et al., NeurIPS 2019): find the pebble on a road; four discrete actions.
+    """Builds the paper's TurtleBot task (Sahni et al., NeurIPS 2019): find the pebble on a road; four discrete actions.
 
-    Episodes start 0.6 m to 1.5 m from the pebble, at any angle: farther off a camera of 64 x 64 pixels hardly sees it.
+    Episodes start 0.6 m to 1.5 m from the pebble, at any angle: farther off a camera of 64 x 64 pixels hardly shows it.
 
     Args:
         random_state: Seed or generator of the starts.

@@ -12,7 +12,7 @@ from ..tasks.pick_and_place import PickAndPlace
 def pick_and_place_2m(
     random_state: int | np.random.RandomState | None = None, time_limit: float = 40.0, reverse_speed: float = 0.0
 ) -> Environment:
-    """The paper's "successive navigation" (Sahni et al., NeurIPS 2019): 2 m, fetch a small red box for a green one.
+    """Builds the paper's "successive navigation" (Sahni et al., NeurIPS 2019): 2 m, a red box goes to a green one.
 
     Args:
         random_state: Seed or generator of the starts.

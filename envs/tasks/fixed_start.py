@@ -1,4 +1,4 @@
-"""Reading what a user fixes of an episode's start."""
+"""Reads what a user fixes of an episode's start."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,8 +10,8 @@ def read_start(start: Mapping[str, Any], entries: Mapping[str, tuple[str, ...]])
     """Reads named vectors.
 
     Args:
-        start: What is fixed: any of the names that the task knows, each with its numbers; one may be a bare number.
-        entries: The names that the task knows, each with what its entries mean.
+        start: What is fixed: any of the names in ``entries``, each with its numbers; one may be a bare number.
+        entries: The task's names, each with what its entries mean.
 
     Returns:
         The vectors of ``start``, float64.

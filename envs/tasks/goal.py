@@ -32,11 +32,11 @@ class Goal:
 
     @property
     def offset(self) -> float:
-        """How far ahead of the robot the prop stands when it is reached, on average over scripted rollouts [m]."""
+        """How far ahead of the robot the prop is when it is reached, on average over scripted rollouts [m]."""
         return self.distance - self.overshoot
 
     def is_reached(self, pose: np.ndarray, position: np.ndarray) -> bool:
-        """Whether a robot at pose [P] has reached the prop at position [2]."""
+        """Returns whether a robot at pose [P] has reached the prop at position [2]."""
         ahead, left = in_robot_frame(pose, position)
         close = self.nearest <= np.hypot(ahead, left) <= self.distance
         return bool(close and ahead > 0 and abs(left) <= self.tolerance)
@@ -63,7 +63,7 @@ class Goal:
 
 
 def in_robot_frame(pose: np.ndarray, position: np.ndarray) -> tuple[float, float]:
-    """How far a position [2] is ahead and to the left of a pose [P], both in metres.
+    """Returns how far a position [2] is ahead and to the left of a pose [P], both in metres.
 
     >>> ahead, left = in_robot_frame(np.array([1.0, 1.0, np.pi / 2]), np.array([1.0, 3.0]))
     >>> round(ahead, 6), round(abs(left), 6)

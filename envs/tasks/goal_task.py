@@ -29,14 +29,14 @@ class GoalTask(composer.Task):
     """Reward 1 and the end when the last goal is reached; a small cost of moving.
 
     Observed are ``pixels``, the robot's image, uint8 [H, W, 3], and ``pose``, float32 [P]: x [m], y [m], yaw [rad],
-    then the ``flags`` of the task, each 0 or 1. The flags of a pose tell which goal is pursued there.
+    then the ``flags`` of the task, each 0 or 1. The flags of a pose select the goal that is pursued there.
 
     A subclass offers :meth:`goal` and says in ``after_step`` when ``_succeeded``; one with flags extends :meth:`pose`.
 
     Args:
         robot: The robot, e.g. ``halgan_envs.robots.rover.Rover``.
         arena: The room; robot and boxes are attached to it.
-        goals: The goals, each by the name under which :meth:`fix_start` knows its box.
+        goals: The goals, each by the name of its box in :meth:`fix_start`.
         min_start_distance: At least so far are the robot and each box apart at the start of an episode [m].
         max_start_distance: At most so far [m]; for goals that are seen from close by only.
         min_box_distance: Between any two boxes at the start of an episode [m].
@@ -52,7 +52,7 @@ class GoalTask(composer.Task):
     """
 
     mission: str
-    """What a person who drives is asked to do."""
+    """A line for a person who drives."""
     flags: tuple[str, ...] = ()
     """Names of the entries of a pose after x, y and yaw."""
     stages: tuple[Mapping[str, Any], ...] = ({},)
@@ -135,7 +135,7 @@ class GoalTask(composer.Task):
 
     @property
     def _box_range(self) -> np.ndarray:
-        # Far enough from the walls that the robot can stand before any side of it.
+        # Far enough from the walls that the robot fits before any side of it.
         return self.arena.half_extent - max(goal.distance for goal in self.goals.values()) - self.robot.radius
 
     @property
@@ -157,16 +157,16 @@ class GoalTask(composer.Task):
         return specs.BoundedArray(lowest.shape, np.float32, lowest, highest, name="pose")
 
     def action_spec(self, physics: Any) -> Any:
-        """That of the robot."""
+        """Returns that of the robot."""
         del physics
         return self.robot.action_spec
 
     def pose(self, physics: Any) -> np.ndarray:
-        """The robot's x [m], y [m], yaw [rad], and the task's flags, float64 [P]."""
+        """Returns the robot's x [m], y [m], yaw [rad], and the task's flags, float64 [P]."""
         return self.robot.pose(physics)
 
     def goal(self, pose: np.ndarray) -> Goal:
-        """The goal that a robot at pose [P] pursues: the flags tell."""
+        """Returns the goal that a robot at pose [P] pursues, which the flags select."""
         raise NotImplementedError
 
     @property
@@ -176,11 +176,11 @@ class GoalTask(composer.Task):
         return tuple(round(self.goal(np.array([0.0, 0.0, 0.0, *setting])).offset, 6) for setting in settings)
 
     def goal_position(self, physics: Any) -> np.ndarray:
-        """Where the goal stands that is pursued at present, x, y [m]; privileged: no agent may ask."""
+        """Returns where the goal is that is pursued at present, x, y [m]; privileged: no agent may know it."""
         return self.goal(self.pose(physics)).prop.position(physics)
 
     def is_success(self, pose: np.ndarray, position: np.ndarray) -> bool:
-        """Whether a robot at pose [P] has reached the goal it pursues, if that stands at position [2]."""
+        """Returns whether a robot at pose [P] has reached the goal it pursues, if that is at position [2]."""
         return self.goal(pose).is_reached(pose, position)
 
     def show(self, physics: Any, pose: np.ndarray, goal_position: np.ndarray | None) -> None:
@@ -311,16 +311,16 @@ class GoalTask(composer.Task):
         self._energy = float(np.hypot(speed / self.robot.max_speed, turn_rate / self.robot.max_turn_rate))
 
     def get_reward(self, physics: Any) -> float:
-        """The success reward, minus the cost of the action."""
+        """Returns the success reward, minus the cost of the action."""
         del physics
         return self.success_reward * self._succeeded - self.energy_cost * self._energy
 
     def should_terminate_episode(self, physics: Any) -> bool:
-        """True on success."""
+        """Returns True on success."""
         del physics
         return self._succeeded
 
     def get_discount(self, physics: Any) -> float:
-        """0 on success, which terminates; 1 otherwise, so that the time limit truncates."""
+        """Returns 0 on success, which terminates; 1 otherwise, so that the time limit truncates."""
         del physics
         return 0.0 if self._succeeded else 1.0

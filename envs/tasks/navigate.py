@@ -8,11 +8,11 @@ from .single_goal import SingleGoalTask
 
 _SUCCESS_DISTANCE = 0.16
 GOAL_OFFSET = _SUCCESS_DISTANCE - OVERSHOOT
-"""How far ahead of the robot the box stands when an episode of the named environments succeeds, on average [m]."""
+"""How far ahead of the robot the box is when an episode of the named environments succeeds, on average [m]."""
 
 
 class Navigate(SingleGoalTask):
-    """Reward 1 and the end when the robot stands close to the box with the box ahead of it; a small cost of moving.
+    """Reward 1 and the end when the robot is close to the box with the box ahead of it; a small cost of moving.
 
     Close: at most ``success_distance`` between the centres of robot and box. The default is the radius of the box's
     footprint (0.0566 m) plus the robot's (0.05 m) plus 1.1 steps of 0.05 m. Ahead: the box's centre is in front, and

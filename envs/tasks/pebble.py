@@ -20,7 +20,7 @@ class FindPebble(SingleGoalTask):
         arena: The road; robot and pebble are attached to it.
         pebble: The goal; starts call it ``pebble``.
         min_start_distance: At least so far are robot and pebble apart at the start of an episode [m].
-        max_start_distance: At most so far [m]; by default from where a robot that faces the pebble sees it well.
+        max_start_distance: At most so far [m]; by default from where a robot turned to the pebble sees it well.
         success_distance: [m].
         nearest: Closer than this the pebble is out of the image, or about to be [m].
         centring_tolerance: [m].

@@ -87,11 +87,11 @@ class PickAndPlace(GoalTask):
         )
 
     def pose(self, physics: Any) -> np.ndarray:
-        """The robot's x [m], y [m], yaw [rad], and ``held``, 0 or 1, float64 [4]."""
+        """Returns the robot's x [m], y [m], yaw [rad], and ``held``, 0 or 1, float64 [4]."""
         return np.append(self.robot.pose(physics), self._held)
 
     def goal(self, pose: np.ndarray) -> Goal:
-        """The red box if ``held`` is 0 in pose [4], else the green box."""
+        """Returns the red box if ``held`` is 0 in pose [4], else the green box."""
         return self._green if pose[_HELD] else self._red
 
     def show(self, physics: Any, pose: np.ndarray, goal_position: np.ndarray | None) -> None:

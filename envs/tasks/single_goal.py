@@ -16,7 +16,7 @@ class SingleGoalTask(GoalTask):
     Args:
         robot: The robot.
         arena: The place; robot and goal are attached to it.
-        name: Under which starts know the goal.
+        name: Of the goal in :meth:`fix_start`.
         goal: The goal.
         min_start_distance: At least so far are robot and goal apart at the start of an episode [m].
         max_start_distance: At most so far [m].
@@ -49,7 +49,7 @@ class SingleGoalTask(GoalTask):
         )
 
     def goal(self, pose: np.ndarray) -> Goal:
-        """The only one, wherever the robot is."""
+        """Returns the only one, wherever the robot is."""
         del pose
         return self._goal
 

@@ -68,7 +68,7 @@ def test_spaces_are_those_of_the_data_contract(name):
 
 
 @pytest.mark.parametrize("name", sorted(halgan_envs.NAMES))
-def test_equal_seeds_give_equal_episodes_and_those_of_the_torchrl_face(name):
+def test_equal_seeds_give_equal_episodes_and_those_of_the_torchrl_adapter(name):
     env, twin = gymnasium.make(IDS[name]), halgan_envs.make(name, seed=7)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(12)]

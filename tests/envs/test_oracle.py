@@ -94,7 +94,9 @@ def test_rendering_after_close_says_so():
 
 
 def test_a_fingerprint_tells_rooms_apart_and_repeats():
-    first, again, other = (halgan_envs.fingerprint(name) for name in ("navigate-2m", "navigate-2m", "navigate-4m"))
+    first, again, other = (
+        dict(halgan_envs.domain(name).fingerprint) for name in ("navigate-2m", "navigate-2m", "navigate-4m")
+    )
     assert first == again
     assert first["golden_frame"] != other["golden_frame"]
     assert set(first) == {"environment", "mujoco", "gl", "golden_frame"}

@@ -402,9 +402,9 @@ def test_the_flag_reaches_torchrl_and_gymnasium():
     env = halgan_envs.make("pick-and-place-2m", seed=0)
     assert env.reset()["pose"].shape == env.observation_spec["pose"].shape == (4,)
     env.close()
-    face = halgan_envs.GymnasiumEnv("pick-and-place-2m")
-    observation, info = face.reset(seed=0, options={"pose": [0.1, 0.2, 0.0], "green_box": [0.24, 0.2], "held": 1})
+    adapter = halgan_envs.GymnasiumEnv("pick-and-place-2m")
+    observation, info = adapter.reset(seed=0, options={"pose": [0.1, 0.2, 0.0], "green_box": [0.24, 0.2], "held": 1})
     assert observation["pose"][3] == 1.0
     assert info == {"is_success": False}
-    assert face.step(BRAKE)[2:] == (True, False, {"is_success": True})
-    face.close()
+    assert adapter.step(BRAKE)[2:] == (True, False, {"is_success": True})
+    adapter.close()
