@@ -5,10 +5,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
+from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+
+from halgan_rl.keys import Keys, dotted
+from halgan_rl.poses import PlanarPoses
+
+HEIGHT_ALONE = 256
+"""Height of a film that shows only what the agent sees [pixels]."""
 
 
 @dataclass(frozen=True)
@@ -16,10 +23,11 @@ class Evaluation:
     """What one evaluation measured, averaged over its episodes.
 
     Attributes:
-        success_rate: share of the episodes that *terminated*, in [0, 1]; running out of time is no success.
+        success_rate: fraction of the episodes that succeeded, in [0, 1]: that *terminated*, for running out of time is
+            no success, or, if ``keys.success`` is given, in which that flag was set.
         episode_return: mean undiscounted sum of rewards.
         episode_length: mean number of steps.
-        flags: by the name of each of the pose's flags, share of the episodes that ended with it set.
+        flags: by the name of each of the pose's flags, fraction of the episodes that ended with it set.
     """
 
     success_rate: float
@@ -28,12 +36,12 @@ class Evaluation:
     flags: Mapping[str, float] = field(default_factory=dict)
 
     def metrics(self, prefix: str = "eval") -> dict[str, float]:
-        """Return the figures under ``prefix/``, ready for a logger."""
+        """Returns the metrics under ``prefix/``, ready for a logger."""
         return {
             f"{prefix}/success_rate": self.success_rate,
             f"{prefix}/return": self.episode_return,
             f"{prefix}/episode_length": self.episode_length,
-            **{f"{prefix}/{flag}": share for flag, share in self.flags.items()},
+            **{f"{prefix}/{flag}": fraction for flag, fraction in self.flags.items()},
         }
 
 
@@ -44,21 +52,22 @@ def evaluate(
     *,
     seeds: Sequence[int],
     max_steps: int = 1_000,
-    flags: Sequence[str] = (),
-    pose_key: NestedKey = "pose",
+    poses: PlanarPoses = PlanarPoses(),
+    keys: Keys = Keys(),
 ) -> Evaluation:
-    """Run the deterministic policy once from each start.
+    """Runs the deterministic policy once from each start.
 
     Args:
         env: an unbatched environment; it is re-seeded before each episode, so give evaluation one of its own.
-        policy: reads the environment's observations and writes ``action``.
+        policy: reads the environment's observations and writes its action.
         seeds: one seed a start; the same seeds are the same starts.
         max_steps: bound on an episode's length, if the environment does not end it before.
-        flags: names of the pose's flags, its entries after the third: how often they are set in the end is reported.
-        pose_key: where the environment writes the pose.
+        poses: its flags are reported: how often each is set in the end. Without flags, no pose is read.
+        keys: where the environment writes what.
 
     Raises:
-        ValueError: if ``seeds`` is empty.
+        ValueError: if ``seeds`` is empty, or the poses are not such poses.
+        KeyError: if the environment does not write a key.
     """
     if not seeds:
         raise ValueError("seeds is empty: give one seed for each start to evaluate")
@@ -67,54 +76,103 @@ def evaluate(
         for seed in seeds:
             env.set_seed(seed)
             episode = env.rollout(max_steps, policy, break_when_any_done=True)
-            successes.append(float(episode["next", "terminated"][-1]))
-            returns.append(float(episode["next", "reward"].sum()))
+            successes.append(_succeeded(episode, keys))
+            returns.append(float(_read_next(episode, "reward", keys).sum()))
             lengths.append(len(episode))
-            if flags:
-                last_flags.append(episode["next"].get(pose_key)[-1, 3:])
+            if poses.flags:
+                pose = _read_next(episode, "pose", keys)[-1]
+                poses.check(pose, dotted(keys.next("pose")))
+                last_flags.append(poses.flag_part(pose))
     n = len(seeds)
-    shares = dict(zip(flags, torch.stack(last_flags).mean(0).tolist(), strict=True)) if flags else {}
-    return Evaluation(sum(successes) / n, sum(returns) / n, sum(lengths) / n, shares)
+    fractions = torch.stack(last_flags).mean(0).tolist() if poses.flags else []
+    flags = dict(zip(poses.flags, fractions, strict=True))
+    return Evaluation(sum(successes) / n, sum(returns) / n, sum(lengths) / n, flags)
+
+
+def _succeeded(episode: TensorDictBase, keys: Keys) -> bool:
+    """Returns whether an episode ``[T]`` terminated or, if ``keys.success`` is given, set that flag at any step."""
+    if keys.success is not None:
+        return bool(_read_next(episode, "success", keys).any())
+    return bool(_read_next(episode, "terminated", keys)[-1].any())
+
+
+def _read_next(episode: TensorDictBase, name: str, keys: Keys) -> Tensor:
+    """Returns the entry of a field of ``keys`` one step later; a missing one is named, with the field to set."""
+    key = keys.next(name)
+    value = episode.get(key, None)
+    if value is None:
+        present = ", ".join(sorted(map(dotted, episode.keys(True, True))))
+        raise KeyError(
+            f"evaluation misses the key {dotted(key)}, set by keys=Keys({name}={getattr(keys, name)!r}). "
+            f"The environment writes {present}."
+        )
+    return value
 
 
 @torch.no_grad()
 def record(
     env: EnvBase,
     policy: TensorDictModuleBase,
-    render: Callable[[], np.ndarray],
+    overview: Callable[[], np.ndarray] | None = None,
     *,
     seeds: Sequence[int],
     max_steps: int = 1_000,
-    pixels_key: NestedKey = "pixels",
+    keys: Keys = Keys(),
+    frame_stack: int = 1,
 ) -> list[np.ndarray]:
-    """Film the deterministic policy: a view from outside beside what the agent sees.
+    """Films the deterministic policy: what the agent sees, to the right of a view from outside if there is one.
 
     Args:
-        env: as for :func:`evaluate`.
+        env: as for :func:`evaluate`; its images are uint8 ``[H, W, C]``.
         policy: as for :func:`evaluate`.
-        render: returns the view from outside, ``[K * H, W', 3]`` uint8, K times as high as the agent's image.
+        overview: returns the view from outside, uint8 ``[H', W', 3]``; the agent's image is scaled to its height, or,
+            if there is none, to 256 pixels.
         seeds: one seed a start.
         max_steps: bound on an episode's length.
-        pixels_key: the agent's own image ``[H, W, 3]`` uint8.
+        keys: where the environment writes what.
+        frame_stack: frames stacked along C, of which the last is shown: C is ``frame_stack`` times 1 (grey) or 3 (RGB).
 
     Returns:
-        Frames ``[K * H, W' + K * W, 3]`` uint8 of all episodes, one after the other.
+        Frames uint8 ``[H', W' + W H' / H, 3]`` of all episodes, one after the other.
+
+    Raises:
+        ValueError: if the environment's images are no such images.
     """
     frames: list[np.ndarray] = []
+
+    def film(state: TensorDictBase) -> None:
+        seen = _last_frame(state[keys.pixels], frame_stack, keys)
+        outside = [] if overview is None else [overview()]
+        height = outside[0].shape[0] if outside else HEIGHT_ALONE
+        frames.append(np.concatenate([*outside, _scale(seen, height)], axis=1))
+
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         for seed in seeds:
             env.set_seed(seed)
             state = env.reset()
             for _ in range(max_steps):
-                frames.append(_side_by_side(render(), state[pixels_key].numpy()))
+                film(state)
                 step = env.step(policy(state))
                 state = step_mdp(step)
-                if step["next", "done"].any():
+                if step[keys.next("done")].any():
                     break
-            frames.append(_side_by_side(render(), state[pixels_key].numpy()))
+            film(state)
     return frames
 
 
-def _side_by_side(outside: np.ndarray, own: np.ndarray) -> np.ndarray:
-    scale = outside.shape[0] // own.shape[0]
-    return np.concatenate([outside, own.repeat(scale, 0).repeat(scale, 1)], axis=1)
+def _last_frame(pixels: Tensor, frame_stack: int, keys: Keys) -> np.ndarray:
+    """Returns the last of the frames stacked in an image ``[H, W, C]``, in RGB ``[H, W, 3]``."""
+    if pixels.dtype != torch.uint8 or pixels.ndim != 3 or pixels.shape[-1] not in (frame_stack, 3 * frame_stack):
+        raise ValueError(
+            f"{dotted(keys.pixels)} is {pixels.dtype} {tuple(pixels.shape)}; a film needs uint8 [H, W, C] with C = "
+            f"frame_stack * 1 or frame_stack * 3, and frame_stack={frame_stack}."
+        )
+    channels = pixels.shape[-1] // frame_stack
+    return pixels[..., -channels:].expand(*pixels.shape[:2], 3).cpu().numpy()
+
+
+def _scale(image: np.ndarray, height: int) -> np.ndarray:
+    """Returns an image ``[H, W, 3]`` scaled to a height by the nearest pixel, which keeps pixels sharp."""
+    rows, columns = image.shape[:2]
+    width = round(columns * height / rows)
+    return image[np.arange(height) * rows // height][:, np.arange(width) * columns // width]

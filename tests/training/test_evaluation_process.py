@@ -1,9 +1,7 @@
-"""A process of its own gives the figures that evaluation here and now gives, of the policy that was handed over."""
+"""A process of its own gives the metrics that evaluation here and now gives, of the policy that was handed over."""
 
 import os
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -18,7 +16,6 @@ from halgan_rl.training.evaluation_process import EvaluationProcess, evaluate_at
 from tests.training.test_evaluation import Corridor
 
 SEEDS = [2, 1, 0]
-ROOT = Path(__file__).parents[2]
 
 
 def make_policy(speed: float) -> TensorDictModule:
@@ -60,68 +57,129 @@ def test_what_evaluation_raises_arrives() -> None:
         process(make_policy(1.0)).result(timeout=60)
 
 
-def test_a_process_that_cannot_start_is_told_with_the_remedy_before_training_begins() -> None:
+def test_what_evaluation_raises_arrives_with_its_traceback() -> None:
+    with EvaluationProcess(Corridor, seeds=SEEDS) as process, pytest.raises(OSError, match="lost") as caught:
+        process(Unplugged()).result(timeout=60)
+    assert "in forward" in "".join(caught.value.__notes__)
+
+
+class Unplugged(nn.Module):
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        raise OSError("lost")
+
+
+def test_an_error_that_cannot_be_sent_arrives_as_text() -> None:
+    with EvaluationProcess(Corridor, seeds=SEEDS) as process, pytest.raises(RuntimeError, match="Unsendable: 1 and 2"):
+        process(Faulty()).result(timeout=60)
+
+
+class Unsendable(Exception):
+    def __init__(self, one: int, other: int) -> None:
+        super().__init__(f"{one} and {other}")
+
+
+class Faulty(nn.Module):
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        raise Unsendable(1, 2)
+
+
+def test_a_process_that_cannot_start_is_reported_with_reason_and_remedy_before_training_begins() -> None:
     process = EvaluationProcess(unmakeable, seeds=SEEDS)
-    with pytest.raises(RuntimeError, match="--no-background-evaluation"):
+    with pytest.raises(RuntimeError, match=r"no display.*--evaluation.no-background"):
         process.__enter__()
+    assert not is_alive(process.pid)
 
 
-def test_a_process_that_dies_is_told_with_the_remedy() -> None:
-    with pytest.raises(RuntimeError, match="has died"), EvaluationProcess(Corridor, seeds=SEEDS) as process:
-        process(Suicide()).result(timeout=60)
+@pytest.mark.parametrize(
+    ("signal_number", "said"),
+    [(signal.SIGKILL, "SIGKILL.*out of memory"), (signal.SIGSEGV, "ended by SIGSEGV"), (None, "exit code 3")],
+    ids=str,
+)
+def test_a_process_that_dies_is_reported_with_what_ended_it(signal_number: signal.Signals | None, said: str) -> None:
+    with EvaluationProcess(Corridor, seeds=SEEDS) as process:
+        first, second = process(Suicide(signal_number)), process(make_policy(1.0))
+        with pytest.raises(RuntimeError, match=f"{said}.*--evaluation.no-background"):
+            first.result(timeout=60)
+        with pytest.raises(RuntimeError, match=said):
+            second.result(timeout=60)
 
 
 class Suicide(nn.Module):
-    """Stands for whatever the system kills."""
+    """Stands for whatever ends a process."""
+
+    def __init__(self, signal_number: signal.Signals | None) -> None:
+        super().__init__()
+        self.signal_number = signal_number
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        os.kill(os.getpid(), signal.SIGKILL)
+        if self.signal_number is None:
+            os._exit(3)
+        os.kill(os.getpid(), self.signal_number)
         return tensordict
 
 
+def test_an_evaluation_that_takes_too_long_is_given_up_and_its_process_ended() -> None:
+    with EvaluationProcess(Corridor, seeds=SEEDS) as process:
+        process._timeout = 0.5
+        with pytest.raises(RuntimeError, match=r"longer than 0.5 s.*--evaluation.no-background"):
+            process(Endless()).result(timeout=60)
+        process._process.join(10)
+        assert not is_alive(process.pid)
+
+
+def test_a_start_that_takes_too_long_is_given_up() -> None:
+    process = EvaluationProcess(unhurried, seeds=SEEDS, timeout=0.5)
+    with pytest.raises(RuntimeError, match=r"longer than 0.5 s"):
+        process.__enter__()
+    assert not is_alive(process.pid)
+
+
+def unhurried() -> Corridor:
+    time.sleep(60)
+    return Corridor()
+
+
+class Endless(nn.Module):
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        time.sleep(60)
+        return tensordict
+
+
+def test_at_the_end_what_goes_on_is_waited_for_and_the_rest_is_dropped() -> None:
+    with EvaluationProcess(Corridor, seeds=SEEDS) as process:
+        first, second, third = process(Pausing(make_policy(1.0))), process(make_policy(0.1)), process(make_policy(0.1))
+        while not first.running():
+            time.sleep(0.01)
+    assert first.result(timeout=0) == evaluate(Corridor(), make_policy(1.0), seeds=SEEDS)
+    assert second.cancelled()
+    assert third.cancelled()
+    assert not is_alive(process.pid)
+
+
+class Pausing(nn.Module):
+    """Takes its time over the first step."""
+
+    def __init__(self, policy: TensorDictModule) -> None:
+        super().__init__()
+        self.policy, self.pause = policy, 1.0
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        time.sleep(self.pause)
+        self.pause = 0.0
+        return self.policy(tensordict)
+
+
 def test_after_an_error_in_training_nothing_is_waited_for() -> None:
-    started = time.monotonic()
-    with pytest.raises(ValueError, match="lost"), EvaluationProcess(Slow, seeds=SEEDS) as process:
+    with pytest.raises(ValueError, match="lost"), EvaluationProcess(Corridor, seeds=SEEDS) as process:
         train_in_vain(process)
-    assert time.monotonic() - started < 30
+    assert not is_alive(process.pid)
 
 
 def train_in_vain(process: EvaluationProcess) -> None:
-    process(make_policy(1.0))
+    evaluation = process(Endless())
+    while not evaluation.running():
+        time.sleep(0.01)
     raise ValueError("lost")
-
-
-class Slow(Corridor):
-    """A minute a reset."""
-
-    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
-        time.sleep(60)
-        return super()._reset(tensordict)
-
-
-PARENT = """
-import os, time
-from halgan_rl.training.evaluation_process import EvaluationProcess
-from tests.training.test_evaluation import Corridor
-if __name__ == "__main__":
-    with EvaluationProcess(Corridor, seeds=[1]) as process:
-        print(process._started.result(), flush=True)
-        time.sleep(60)
-"""
-
-
-def test_the_process_ends_with_its_parent_however_that_ends(tmp_path: Path) -> None:
-    (tmp_path / "parent.py").write_text(PARENT)
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    command = [sys.executable, str(tmp_path / "parent.py")]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as parent:
-        child = int(parent.stdout.readline())
-        assert is_alive(child)
-        parent.kill()
-    deadline = time.monotonic() + 10
-    while is_alive(child) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert not is_alive(child)
 
 
 def is_alive(pid: int) -> bool:
