@@ -1,4 +1,4 @@
-"""What the tests of the environments share."""
+"""What the tests of the environments have in common."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -30,7 +30,7 @@ class Stage:
         mujoco.mj_forward(self.physics.model.ptr, self.physics.data.ptr)
 
     def step(self, forward: float = 0.0, turn: float = 0.0) -> Any:
-        """Steps at a share of the full speed and a share of the full turn rate."""
+        """Steps at a fraction of the full speed and a fraction of the full turn rate."""
         return self.environment.step(np.array([2 * forward - 1, turn]))
 
     def pose(self) -> np.ndarray:
