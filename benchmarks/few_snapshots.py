@@ -4,9 +4,9 @@ Usage::
 
     python -m benchmarks.few_snapshots --out results/few-snapshots   # half an hour on one core
 
-For each size of R a generator is trained (``recipes/train_halgan.py``), compared with the simulator's truth
-(``recipes/evaluate_halgan.py``), and used by an agent in the 2 m room (``recipes/ddpg_navigate.py``). Into the folder
-go pictures, the agents' curves and one table.
+For each size of R a generator is trained (``recipes/train_generator.py``), compared with the simulator's truth
+(``recipes/evaluate_generator.py``), and used by an agent in the 2 m room (``recipes/ddpg_navigate.py``). Into the
+folder go pictures, the agents' curves and one table.
 """
 
 import dataclasses
@@ -19,8 +19,9 @@ import torch
 import tyro
 
 from benchmarks.tables import Table, report
+from halgan_rl.experiment.presets import changed
 from halgan_rl.experiment.run_folder import check_unused, read_metrics
-from recipes import ddpg_navigate, evaluate_halgan, train_halgan
+from recipes import ddpg_navigate, evaluate_generator, train_generator
 
 HEADER = (
     "snapshots",
@@ -47,7 +48,7 @@ class Study:
 
 
 def main(study: Study) -> None:
-    """Train, judge and use a generator of each size, and write the table."""
+    """Trains, judges and uses a generator of each size, and writes the table."""
     check_unused(study.out)
     torch.set_num_threads(1)
     study.out.mkdir(parents=True, exist_ok=True)
@@ -57,25 +58,29 @@ def main(study: Study) -> None:
 
 
 def judge(size: int, study: Study) -> list[str]:
-    """Return the table's line for one size of R."""
+    """Returns the table's line for one size of R."""
     with TemporaryDirectory() as temporary:
         generator, judged, agent = (Path(temporary, name) for name in ("generator", "judged", "agent"))
-        train_halgan.main(train_halgan.Config(near_goal_frames=size, seed=study.seed, out=generator))
+        train_generator.main(train_generator.Config(near_goal_frames=size, seed=study.seed, out=generator))
         weights = generator / "generator.safetensors"
-        evaluate_halgan.main(evaluate_halgan.Config(weights=weights, out=judged))
-        config = ddpg_navigate.Config(
-            weights=weights, total_frames=study.total_frames, seed=study.seed, out=agent, film_starts=1
-        )
-        ddpg_navigate.main(config)
+        evaluate_generator.main(evaluate_generator.Config(weights=weights, out=judged))
+        changes = {
+            "painter.weights": weights,
+            "total_frames": study.total_frames,
+            "seed": study.seed,
+            "out": agent,
+            "evaluation.film_starts": 1,
+        }
+        ddpg_navigate.main(changed(ddpg_navigate.DEFAULT, changes))
         shutil.copy(agent / "metrics.csv", study.out / f"{size}-snapshots-seed{study.seed}.csv")
         shutil.copy(generator / "hallucinations.png", study.out / f"{size}-snapshots.png")
-        figures, curve = json.loads((judged / "fidelity.json").read_text()), read_metrics(agent / "metrics.csv")
+        found, curve = json.loads((judged / "fidelity.json").read_text()), read_metrics(agent / "metrics.csv")
     return [
         str(size),
-        f"{figures['probe']['ratio']['bearing']:.2f}",
-        f"{figures['probe']['ratio']['distance']:.2f}",
-        f"{figures['mask']['within 1 m']['overlap']:.2f}",
-        f"{figures['no_op']['out_of_view']:.2f}",
+        f"{found['probe']['ratio']['bearing']:.2f}",
+        f"{found['probe']['ratio']['distance']:.2f}",
+        f"{found['mask']['within 1 m']['overlap']:.2f}",
+        f"{found['no_op']['out_of_view']:.2f}",
         ", ".join(
             f"{success:.0%} ({frames:.0f})"
             for frames, success in zip(curve["frames"], curve["eval/success_rate"], strict=True)

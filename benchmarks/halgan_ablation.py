@@ -4,10 +4,10 @@ Usage::
 
     python -m benchmarks.halgan_ablation --out results/ablation   # two hours on one core
 
-Trains a generator with ``recipes/train_halgan.py`` for each variant, each for the same minutes: the shipped way (a
-warm start, no game), and the game with all ideas but one. At intervals each is compared with the simulator's truth on
-the same held-out poses. Into the folder go the runs' curves, one picture and one table: fidelity in the end, steps made
-in that time, and when the variant reached the best that the paper's own loop got to.
+Trains a generator with ``recipes/train_generator.py`` for each variant, each for the same minutes: as shipped (by matte
+regression alone), and by adversarial training with all ideas but one. At intervals each is compared with the
+simulator's truth on the same held-out poses. Into the folder go the runs' curves, one picture and one table: fidelity
+in the end, steps made in that time, and when the variant reached the best that the paper's own loop got to.
 """
 
 import dataclasses
@@ -21,33 +21,38 @@ import tyro
 from matplotlib.figure import Figure
 
 from benchmarks.tables import Table, report
+from halgan_rl.experiment.presets import changed
 from halgan_rl.experiment.run_folder import read_metrics
-from recipes import train_halgan
+from recipes import train_generator
 
-GAME = {"warm_start_steps": 0, "iterations": 1_000_000, "evaluate_every": 50}
-"""The game from scratch, with all ideas: what the variants below take one idea from."""
+ADVERSARIAL: dict[str, Any] = {"mattes.steps": 0, "adversarial.steps": 1_000_000, "evaluate_every": 50}
+"""Adversarial training from scratch, with all ideas: what the variants below take one idea from."""
+PAPERS_GENERATOR: dict[str, Any] = {"generator.kind": "paper"}
 
 PAPER = "paper's loop"
 VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
-    "shipped: warm start, no game": ("default", {}),
+    "shipped: matte regression alone": ("default", {}),
     "shipped, not mirrored": ("default", {"mirror": False}),
-    "shipped, distance and bearing for a configuration": ("default", {"configuration": "polar"}),
-    "warm start, then game": ("default", {"iterations": 1_000_000}),
-    "game with all ideas": ("default", GAME),
-    "game, no moving average": ("default", GAME | {"average_decay": 0.0}),
-    "game, penalty at every step": ("default", GAME | {"penalty_interval": 1}),
-    "game, 5 critic steps": ("default", GAME | {"critic_steps": 5, "evaluate_every": 20}),
-    "game, not mirrored": ("default", GAME | {"mirror": False}),
-    "game, distance and bearing for a configuration": (
+    "shipped, distance and bearing for a configuration": ("default", {"generator.configuration": "polar"}),
+    "matte regression, then adversarial": ("default", {"adversarial.steps": 1_000_000}),
+    "adversarial with all ideas": ("default", ADVERSARIAL),
+    "adversarial, no moving average": ("default", ADVERSARIAL | {"adversarial.average_decay": 0.0}),
+    "adversarial, penalty at every step": ("default", ADVERSARIAL | {"adversarial.penalty_interval": 1}),
+    "adversarial, 5 critic steps": ("default", ADVERSARIAL | {"adversarial.critic_steps": 5, "evaluate_every": 20}),
+    "adversarial, not mirrored": ("default", ADVERSARIAL | {"mirror": False}),
+    "adversarial, distance and bearing for a configuration": (
         "default",
-        GAME | {"configuration": "polar", "standardise": False},
+        ADVERSARIAL | {"generator.configuration": "polar", "generator.standardise": False},
     ),
-    "game, wide kernel density": ("default", GAME | {"bandwidth": 1.0}),
-    "game, paper's generator, identity where H = 0": ("default", GAME | {"generator": "paper"}),
-    "game, paper's generator, tanh(s + H)": ("default", GAME | {"generator": "paper", "composition": "dimming"}),
+    "adversarial, wide kernel density": ("default", ADVERSARIAL | {"adversarial.bandwidth": 1.0}),
+    "adversarial, paper's generator, identity where H = 0": ("default", ADVERSARIAL | PAPERS_GENERATOR),
+    "adversarial, paper's generator, tanh(s + H)": (
+        "default",
+        ADVERSARIAL | PAPERS_GENERATOR | {"generator.composition": "dimming"},
+    ),
     PAPER: ("paper", {"evaluate_every": 5}),
 }
-"""Name: preset of ``train_halgan``, and what is changed of it; keys are its fields or those of its ``game``."""
+"""Name: preset of ``train_generator``, and what is changed of it, by the names of its flags."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +72,7 @@ class Ablation:
 
 
 def main(ablation: Ablation) -> None:
-    """Train all variants, and write the table."""
+    """Trains all variants, and writes the table."""
     unknown = set(ablation.only) - set(VARIANTS)
     if unknown:
         raise ValueError(f"unknown variants {sorted(unknown)}: choose from {list(VARIANTS)}")
@@ -83,28 +88,24 @@ def main(ablation: Ablation) -> None:
 
 
 def train(name: str, ablation: Ablation, kept: Path) -> None:
-    """Train one variant; keep its curve and its picture."""
+    """Trains one variant; keeps its curve and its picture."""
     with TemporaryDirectory() as folder:
         config = make_config(name, ablation, Path(folder, "run"))
-        train_halgan.main(config)
+        train_generator.main(config)
         shutil.copy(config.out / "hallucinations.png", kept.with_suffix(".png"))
         shutil.copy(config.out / "metrics.csv", kept)
 
 
-def make_config(name: str, ablation: Ablation, out: Path) -> train_halgan.Config:
-    """Return the configuration of a variant."""
+def make_config(name: str, ablation: Ablation, out: Path) -> train_generator.Config:
+    """Returns the configuration of a variant."""
     preset, changes = VARIANTS[name]
-    config = train_halgan.PRESETS[preset]
-    game_fields = {field.name for field in dataclasses.fields(config.game)}
-    game = {key: value for key, value in changes.items() if key in game_fields}
-    rest = {key: value for key, value in changes.items() if key not in game_fields}
     minutes = ablation.paper_minutes if name == PAPER else ablation.minutes
-    game_settings = dataclasses.replace(config.game, **game)
-    return dataclasses.replace(config, **rest, game=game_settings, minutes=minutes, seed=ablation.seed, out=out)
+    common = {"minutes": minutes, "seed": ablation.seed, "out": out}
+    return changed(train_generator.PRESETS[preset], changes | common)
 
 
 def write_report(ablation: Ablation, curves: dict[str, dict[str, list[float]]]) -> None:
-    """Write table and picture of the variants that have been trained."""
+    """Writes table and picture of the variants that have been trained."""
     best = max(curves[PAPER]["truth/mask_overlap"]) if PAPER in curves else float("nan")
     lines = [
         [
@@ -134,7 +135,7 @@ def write_report(ablation: Ablation, curves: dict[str, dict[str, list[float]]]) 
 
 
 def reached(curve: dict[str, list[float]], overlap: float) -> str:
-    """Return the minutes after which a curve first reaches an overlap."""
+    """Returns the minutes after which a curve first reaches an overlap."""
     minutes = [
         seconds / 60
         for seconds, value in zip(curve["seconds"], curve["truth/mask_overlap"], strict=True)

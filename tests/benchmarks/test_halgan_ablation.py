@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks import halgan_ablation
 from benchmarks.halgan_ablation import PAPER, VARIANTS, Ablation, make_config
-from recipes import train_halgan
+from recipes import train_generator
 
 
 def test_variants_differ_from_each_other_and_leave_the_paper_alone() -> None:
@@ -16,14 +16,14 @@ def test_variants_differ_from_each_other_and_leave_the_paper_alone() -> None:
     assert len({json.dumps(dataclasses.asdict(config), default=str) for config in configs}) == len(VARIANTS)
     paper = dataclasses.asdict(make_config(PAPER, Ablation(), Path("out")))
     changed = {
-        name for name, value in dataclasses.asdict(train_halgan.PRESETS["paper"]).items() if paper[name] != value
+        name for name, value in dataclasses.asdict(train_generator.PRESETS["paper"]).items() if paper[name] != value
     }
     assert changed == {"minutes", "evaluate_every", "out"}
 
 
 def test_the_table_has_a_line_for_each_variant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tiny = {"near_goal_frames": 40, "failed_frames": 40, "held_out_frames": 4, "evaluate_every": 1}
-    shipped = "shipped: warm start, no game"
+    shipped = "shipped: matte regression alone"
     monkeypatch.setattr(halgan_ablation, "VARIANTS", {shipped: ("default", tiny), PAPER: ("paper", tiny)})
     ablation = Ablation(out=tmp_path / "table", minutes=1e-6, paper_minutes=1e-6, only=(shipped, PAPER))
     halgan_ablation.main(ablation)

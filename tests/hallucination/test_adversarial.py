@@ -1,30 +1,43 @@
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
 import torch
 from torch import Tensor, nn
 
+from halgan_rl.hallucination.generators.base import HallucinationGenerator
 from halgan_rl.hallucination.generators.coordinates import CoordinateGenerator
-from halgan_rl.hallucination.generators.paper import Discriminator, HallucinationGenerator, PaperGenerator
-from halgan_rl.hallucination.training.adversarial import GanSettings, HalganTrainer, scott_kernel
+from halgan_rl.hallucination.generators.paper import PaperGenerator
+from halgan_rl.hallucination.training.adversarial import AdversarialConfig, AdversarialTrainer, scott_kernel
+from halgan_rl.hallucination.training.discriminator import Discriminator
+from halgan_rl.poses import PlanarPoses
 from tests import synthetic
 
-SETTINGS = GanSettings(batch_size=4, critic_steps=1, mirror=True, average_decay=0.9, penalty_interval=2)
-SMALL = GanSettings(batch_size=4, critic_steps=1)
+LAZY = AdversarialConfig(batch_size=4, critic_steps=1, average_decay=0.9, penalty_interval=2)
+SMALL = AdversarialConfig(batch_size=4, critic_steps=1)
 
 
-def make_trainer(kind: Literal["paper", "coordinates"], settings: GanSettings, seed: int = 0) -> HalganTrainer:
+def make_trainer(
+    kind: Literal["paper", "coordinates"],
+    config: AdversarialConfig,
+    seed: int = 0,
+    *,
+    mirror: bool = False,
+    image_shape: tuple[int, int, int] = (64, 64, 3),
+    frame_stack: int = 1,
+) -> AdversarialTrainer:
     torch.manual_seed(0)
+    shape: dict[str, Any] = {"image_shape": image_shape, "frame_stack": frame_stack}
     generator: HallucinationGenerator = (
-        PaperGenerator(latent_size=16) if kind == "paper" else CoordinateGenerator(width=8, depth=1)
+        PaperGenerator(latent_size=16, **shape) if kind == "paper" else CoordinateGenerator(width=8, depth=1, **shape)
     )
-    return HalganTrainer(
+    return AdversarialTrainer(
         generator,
-        Discriminator(generator.encoding.size, first_stride=2),
-        near_goal=synthetic.near_goal(16),
-        failed=synthetic.failed(16),
-        settings=settings,
+        Discriminator(generator.encoding.size, image_shape=image_shape, first_stride=2),
+        near_goal=synthetic.near_goal(16, **shape),
+        failed=synthetic.failed(16, **shape),
+        config=config,
         rng=torch.Generator().manual_seed(seed),
+        mirror=mirror,
     )
 
 
@@ -32,11 +45,13 @@ def copy(network: nn.Module) -> dict[str, Tensor]:
     return {name: tensor.detach().clone() for name, tensor in network.named_parameters()}
 
 
-@pytest.mark.parametrize(("kind", "settings"), [("paper", SMALL), ("coordinates", SETTINGS)])
-def test_a_step_changes_every_parameter_of_both_networks(
-    kind: Literal["paper", "coordinates"], settings: GanSettings
+@pytest.mark.parametrize(("kind", "config"), [("paper", SMALL), ("coordinates", LAZY)])
+@pytest.mark.parametrize("shape", ["64x64x3", *synthetic.SHAPES])
+def test_a_step_changes_every_parameter_of_both_networks_whatever_the_shape_of_images(
+    kind: Literal["paper", "coordinates"], config: AdversarialConfig, shape: str
 ) -> None:
-    trainer = make_trainer(kind, settings)
+    image_shape, frame_stack = synthetic.SHAPES.get(shape, (synthetic.RGB, 1))
+    trainer = make_trainer(kind, config, image_shape=image_shape, frame_stack=frame_stack)
     before = copy(trainer.generator), copy(trainer.discriminator)
     metrics = trainer.step()
     for old, network in zip(before, (trainer.generator, trainer.discriminator), strict=True):
@@ -47,7 +62,7 @@ def test_a_step_changes_every_parameter_of_both_networks(
 
 
 def test_equal_seeds_give_equal_weights_and_other_seeds_do_not() -> None:
-    trainers = [make_trainer("coordinates", SETTINGS, seed) for seed in (0, 0, 1)]
+    trainers = [make_trainer("coordinates", LAZY, seed, mirror=True) for seed in (0, 0, 1)]
     for trainer in trainers:
         for _ in range(3):
             trainer.step()
@@ -57,7 +72,7 @@ def test_equal_seeds_give_equal_weights_and_other_seeds_do_not() -> None:
 
 
 def test_the_average_lags_behind_the_generator_and_a_decay_of_0_keeps_the_last_weights() -> None:
-    lagging, last = make_trainer("coordinates", SETTINGS), make_trainer("coordinates", SMALL)
+    lagging, last = make_trainer("coordinates", LAZY), make_trainer("coordinates", SMALL)
     before = copy(lagging.generator)["paint.0.weight"]
     for trainer in (lagging, last):
         trainer.step()
@@ -68,7 +83,7 @@ def test_the_average_lags_behind_the_generator_and_a_decay_of_0_keeps_the_last_w
 
 
 def test_a_lazy_penalty_counts_as_much_as_it_is_rarer() -> None:
-    trainer = make_trainer("coordinates", SETTINGS)
+    trainer = make_trainer("coordinates", LAZY)
     calls = []
     penalty = trainer._gradient_penalty
     trainer._gradient_penalty = lambda *args: calls.append(1) or penalty(*args)  # type: ignore[method-assign, func-returns-value]
@@ -79,7 +94,7 @@ def test_a_lazy_penalty_counts_as_much_as_it_is_rarer() -> None:
 
 def test_mirrored_images_come_with_mirrored_labels() -> None:
     """A bright left half goes with a goal to the left, also in the mirror."""
-    trainer = make_trainer("coordinates", GanSettings(batch_size=32, mirror=True, label_noise=(0.0, 0.0)))
+    trainer = make_trainer("coordinates", AdversarialConfig(batch_size=32, label_noise=(0.0, 0.0)), mirror=True)
     trainer._real_pixels = torch.zeros(16, 64, 64, 3, dtype=torch.uint8)
     trainer._real_pixels[:, :, :32] = 255
     trainer._labels = torch.tensor([[1.0, 0.5, 0.2]]).expand(16, -1)
@@ -92,18 +107,37 @@ def test_mirrored_images_come_with_mirrored_labels() -> None:
 
 def test_fakes_show_the_goal_that_is_pursued_in_their_failed_frame() -> None:
     """Failed frames with a red bar below have a flag of 1, and so have the configurations painted into them."""
-    trainer = HalganTrainer(
+    trainer = AdversarialTrainer(
         CoordinateGenerator(pose_size=4, opacity=1e-6),
         Discriminator(5, first_stride=2),
         near_goal=synthetic.near_goal(16, flagged=True),
         failed=synthetic.failed(16, flagged=True),
-        settings=GanSettings(batch_size=32),
+        config=AdversarialConfig(batch_size=32),
+        poses=PlanarPoses(flags=("held",)),
         rng=torch.Generator().manual_seed(0),
     )
     images, features, _ = trainer._draw_fake()
     red_below = images[:, 0, 60, 0] > images[:, 1, 60, 0] + 0.5
     assert 0 < red_below.sum() < 32
     assert torch.equal(features[:, 4], red_below.float())
+
+
+def test_frames_of_another_shape_than_the_generators_are_refused_before_training() -> None:
+    with pytest.raises(ValueError, match=r"near_goal\['pixels'\] is torch.uint8 \[16, 84, 84, 3\].*\[N, 64, 64, 3\]"):
+        AdversarialTrainer(
+            CoordinateGenerator(),
+            Discriminator(4),
+            near_goal=synthetic.near_goal(16, image_shape=(84, 84, 3)),
+            failed=synthetic.failed(16),
+            config=SMALL,
+            rng=torch.Generator(),
+        )
+
+
+@pytest.mark.parametrize("changes", [{"batch_size": 0}, {"critic_steps": 0}, {"penalty_interval": 0}, {"steps": -1}])
+def test_counts_that_cannot_work_are_refused(changes: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match=next(iter(changes))):
+        AdversarialConfig(**changes)  # type: ignore[arg-type]
 
 
 def test_the_density_of_configurations_is_scotts() -> None:

@@ -8,11 +8,14 @@ from torch import Tensor
 from halgan_rl.hallucination.bank import BankGrid, HallucinationBank
 from halgan_rl.hallucination.generators.coordinates import CoordinateGenerator
 from halgan_rl.hallucination.generators.paper import PaperGenerator
-from halgan_rl.hallucination.hallucinators import GanHallucinator
-from halgan_rl.poses import relative_pose
-from tests.synthetic import vivid_generator
+from halgan_rl.hallucination.hallucinators import GeneratorHallucinator
+from halgan_rl.poses import PlanarPoses, relative_pose
+from tests.synthetic import SHAPES, vivid_generator
 
-SMALL = {"goal_offset": 0.0, "distances": 5, "bearings": 7, "yaws": 3, "latents": 2}
+AT_POSE = PlanarPoses()
+"""Goals stand where their goal poses are."""
+AHEAD = PlanarPoses(goal_offsets=(0.2,))
+SMALL = {"distances": 5, "bearings": 7, "yaws": 3, "latents": 2}
 
 
 @pytest.fixture
@@ -24,37 +27,40 @@ def random_source(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def make(generator: CoordinateGenerator | PaperGenerator, *, seed: int = 0, **grid: object) -> HallucinationBank:
-    return HallucinationBank(generator, BankGrid(**(SMALL | grid)), rng=random_source(seed))  # type: ignore[arg-type]
+def make(
+    generator: CoordinateGenerator | PaperGenerator, *, seed: int = 0, poses: PlanarPoses = AT_POSE, **grid: object
+) -> HallucinationBank:
+    return HallucinationBank(generator, BankGrid(**(SMALL | grid)), poses=poses, rng=random_source(seed))  # type: ignore[arg-type]
 
 
-def random_frames(*shape: int) -> Tensor:
-    return torch.randint(0, 256, (*shape, 64, 64, 3), generator=random_source(1)).to(torch.uint8)
+def random_frames(*shape: int, image_shape: tuple[int, int, int] = (64, 64, 3)) -> Tensor:
+    return torch.randint(0, 256, (*shape, *image_shape), generator=random_source(1)).to(torch.uint8)
 
 
 @pytest.mark.parametrize("goal_offset", [0.0, 0.2])
 @pytest.mark.parametrize("yaws", [1, 4])
 def test_each_cell_is_nearest_to_its_own_centre(goal_offset: float, yaws: int) -> None:
-    grid = BankGrid(goal_offset=goal_offset, distances=9, bearings=11, yaws=yaws, widest=0.9)
-    cells, in_sight = grid.cells_at(torch.zeros(3), grid.relative_poses(goal_offset), goal_offset)
+    grid = BankGrid(distances=9, bearings=11, yaws=yaws, widest=0.9)
+    poses = PlanarPoses(goal_offsets=(goal_offset,))
+    cells, in_sight = grid.cells_at(torch.zeros(3), grid.relative_poses(goal_offset), poses)
     assert cells.tolist() == list(range(grid.cells)) == list(range(9 * 11 * yaws))
     inner = torch.arange(grid.cells).reshape(9, 11, yaws)[:, 1:-1].flatten()  # the outermost bearings may round away
     assert in_sight[inner].all()
 
 
 def test_a_cell_depends_on_the_relative_pose_only() -> None:
-    grid = BankGrid(goal_offset=0.2, distances=9, bearings=11, yaws=4, widest=0.9)
+    grid = BankGrid(distances=9, bearings=11, yaws=4, widest=0.9)
     relative = grid.relative_poses(0.2)
     yaw = torch.linspace(-9.0, 9.0, len(relative))
     pose = torch.stack([yaw.cos(), 2 * yaw.sin(), yaw], -1)
     x, y, turn = relative.unbind(-1)
     ahead, left = torch.stack([yaw.cos(), yaw.sin()], -1), torch.stack([-yaw.sin(), yaw.cos()], -1)
     goal = torch.cat([pose[:, :2] + x[:, None] * ahead + y[:, None] * left, (yaw + turn)[:, None]], -1)
-    assert grid.cells_at(pose, goal, 0.2)[0].tolist() == list(range(grid.cells))
+    assert grid.cells_at(pose, goal, AHEAD)[0].tolist() == list(range(grid.cells))
 
 
 def test_cells_are_spaced_by_bearing_and_inverse_distance_of_the_goal_itself() -> None:
-    grid = BankGrid(goal_offset=0.2, nearest=0.2, farthest=2.0, widest=0.5, distances=10, bearings=3, yaws=2)
+    grid = BankGrid(nearest=0.2, farthest=2.0, widest=0.5, distances=10, bearings=3, yaws=2)
     x, y, yaw = grid.relative_poses(0.2).reshape(10, 3, 2, 3)[4, 2].unbind(-1)
     assert yaw.tolist() == pytest.approx([0, math.pi])
     goal = torch.stack([x + 0.2 * yaw.cos(), y + 0.2 * yaw.sin()], -1)
@@ -64,24 +70,27 @@ def test_cells_are_spaced_by_bearing_and_inverse_distance_of_the_goal_itself() -
 
 
 def test_what_is_nearer_or_farther_than_the_grid_is_painted_at_its_edge() -> None:
-    grid = BankGrid(goal_offset=0.0, distances=4, bearings=5)
-    near, far = grid.cells_at(torch.zeros(3), torch.tensor([[1e-4, 0.0, 0.0], [99.0, 0.0, 0.0]]), 0.0)[0]
+    grid = BankGrid(distances=4, bearings=5)
+    near, far = grid.cells_at(torch.zeros(3), torch.tensor([[1e-4, 0.0, 0.0], [99.0, 0.0, 0.0]]), AT_POSE)[0]
     ends = torch.tensor([[grid.nearest, 0.0, 0.0], [grid.farthest, 0.0, 0.0]])
-    edges = grid.cells_at(torch.zeros(3), ends, 0.0)[0]
+    edges = grid.cells_at(torch.zeros(3), ends, AT_POSE)[0]
     assert [near, far] == edges.tolist()
 
 
-def test_at_a_cell_the_bank_paints_what_the_generator_does(generator: CoordinateGenerator) -> None:
+@pytest.mark.parametrize("shape", ["64x64x3", *SHAPES])
+def test_at_a_cell_the_bank_paints_what_the_generator_does(shape: str) -> None:
+    image_shape, frame_stack = SHAPES.get(shape, ((64, 64, 3), 1))
+    generator = vivid_generator(image_shape=image_shape, frame_stack=frame_stack)
     grid = BankGrid(**SMALL)  # type: ignore[arg-type]
     bank = HallucinationBank(generator, grid, rng=random_source())
     latents = generator.sample_latent(grid.latents, random_source())
     goals = grid.relative_poses(0.0).reshape(5, 7, 3, 3)[:, 1:-1].flatten(0, 2)[:, None]
-    frames, poses = random_frames(len(goals), 1), torch.zeros(len(goals), 1, 3)
+    frames, poses = random_frames(len(goals), 1, image_shape=image_shape), torch.zeros(len(goals), 1, 3)
     seen = bank(frames, poses, goals)
     errors = []
     for latent in latents:
         generator.sample_latent = lambda count, rng, latent=latent: latent.expand(count, -1)  # type: ignore[method-assign, misc]
-        exact = GanHallucinator(generator, rng=random_source())(frames, poses, goals)
+        exact = GeneratorHallucinator(generator, rng=random_source())(frames, poses, goals)
         errors.append((seen.int() - exact.int()).abs().flatten(1).amax(1))
     assert torch.stack(errors).amin(0).max() <= 4  # 8 bits of colour and opacity, and pixels too faint to keep
     assert all((error > 20).any() for error in errors)  # each latent has rows of its own
@@ -126,7 +135,7 @@ def test_given_frames_stay(generator: CoordinateGenerator) -> None:
 
 
 def test_flags_of_the_pose_choose_what_is_painted() -> None:
-    bank = make(vivid_generator(pose_size=4), latents=1)
+    bank = make(vivid_generator(pose_size=4), latents=1, poses=PlanarPoses(flags=("held",)))
     frames = random_frames(1, 1).expand(2, 1, -1, -1, -1)
     pose = torch.tensor([[[0.0, 0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0, 1.0]]])
     painted = bank(frames, pose, torch.tensor([[0.5, 0.0, 0.0, 1.0]]).expand(2, 1, 4))
@@ -135,14 +144,12 @@ def test_flags_of_the_pose_choose_what_is_painted() -> None:
 
 def test_each_setting_of_the_flags_has_an_offset_of_its_own() -> None:
     generator, offsets = vivid_generator(pose_size=4), (0.0, 0.3)
-    bank = make(generator, latents=1, yaws=1, goal_offset=offsets)
+    bank = make(generator, latents=1, yaws=1, poses=PlanarPoses(flags=("held",), goal_offsets=offsets))
     frames = random_frames(1, 1)
     for flag, offset in enumerate(offsets):
         pose, straight = torch.tensor([[[0.0, 0.0, 0.0, flag]]]), torch.tensor([[[0.5, 0.0, 0.0, flag]]])
         turned = torch.tensor([[[0.5 + offset, -offset, math.pi / 2, flag]]])  # about a goal that far ahead of it
         assert torch.equal(bank(frames, pose, straight), bank(frames, pose, turned))
-    with pytest.raises(ValueError, match=r"has 3 entries, but the poses' flags have 2 settings"):
-        make(generator, goal_offset=(0.0, 0.1, 0.2))
 
 
 def test_the_same_seed_gives_the_same_images(generator: CoordinateGenerator) -> None:
@@ -167,9 +174,31 @@ def test_a_generator_that_lays_no_matte_is_refused(composition: Literal["dimming
     generator = PaperGenerator(composition=composition).train()
     with torch.no_grad():
         generator.layers[-2].bias.fill_(0.5)  # type: ignore[union-attr, operator]
-    with pytest.raises(ValueError, match=r"PaperGenerator does not lay a matte.*CoordinateGenerator.*--no-bank"):
+    with pytest.raises(ValueError, match=r"PaperGenerator does not lay a matte.*CoordinateGenerator.*no-bank"):
         make(generator)
     assert generator.training
+
+
+def test_flags_that_the_generator_does_not_know_are_refused_before_anything_is_tabulated(
+    generator: CoordinateGenerator,
+) -> None:
+    with pytest.raises(ValueError, match=r"takes poses of 3 entries.*\('held',\) are 4"):
+        make(generator, poses=PlanarPoses(flags=("held",)))
+
+
+@pytest.mark.parametrize("shape", [(2, 2, 64, 64, 12), (2, 2, 3, 64, 64), (2, 2, 84, 84, 3), (2, 64, 64, 3)])
+def test_images_of_another_shape_are_refused(generator: CoordinateGenerator, shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=rf"pixels are torch.uint8 \{list(shape)}.*\[N, F, 64, 64, 3\]"):
+        make(generator)(torch.zeros(shape, dtype=torch.uint8), torch.zeros(2, 2, 3), torch.zeros(2, 1, 3))
+
+
+def test_float_images_are_refused(generator: CoordinateGenerator) -> None:
+    with pytest.raises(ValueError, match=r"pixels are torch\.float32"):
+        make(generator)(torch.zeros(2, 2, 64, 64, 3), torch.zeros(2, 2, 3), torch.zeros(2, 1, 3))
+
+
+def test_the_bank_has_the_image_shape_of_its_generator() -> None:
+    assert make(vivid_generator(image_shape=(48, 32, 2), frame_stack=2)).image_shape == (48, 32, 2)
 
 
 def test_poses_of_another_size_or_not_finite_are_refused(generator: CoordinateGenerator) -> None:
@@ -186,11 +215,10 @@ def test_poses_of_another_size_or_not_finite_are_refused(generator: CoordinateGe
         ({"nearest": 0.0}, "0 < nearest"),
         ({"nearest": 2.0, "farthest": 1.0}, "2.0 and 1.0"),
         ({"widest": 4.0}, "widest=4.0"),
-        ({"goal_offset": -0.1}, "goal_offset=-0.1"),
         ({"distances": 1}, "at least 2 distances"),
         ({"latents": 0}, "1 latent"),
     ],
 )
 def test_grids_that_make_no_sense_are_refused(grid: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        BankGrid(**({"goal_offset": 0.0} | grid))  # type: ignore[arg-type]
+        BankGrid(**grid)  # type: ignore[arg-type]

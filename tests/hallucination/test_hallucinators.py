@@ -4,8 +4,9 @@ from torch import Tensor
 
 from halgan_rl.hallucination.generators.coordinates import CoordinateGenerator
 from halgan_rl.hallucination.generators.paper import PaperGenerator
-from halgan_rl.hallucination.hallucinators import GanHallucinator, RandomFlags
-from tests.synthetic import vivid_generator
+from halgan_rl.hallucination.hallucinators import GeneratorHallucinator, RandomFlags
+from halgan_rl.poses import PlanarPoses
+from tests.synthetic import SHAPES, vivid_generator
 
 ROWS, FRAMES = 3, 2
 
@@ -24,8 +25,10 @@ def rows() -> tuple[Tensor, Tensor, Tensor]:
 
 def hallucinator(
     generator: CoordinateGenerator | PaperGenerator, *, share_latent: bool = True, chunk: int = 4
-) -> GanHallucinator:
-    return GanHallucinator(generator, rng=torch.Generator().manual_seed(2), share_latent=share_latent, chunk=chunk)
+) -> GeneratorHallucinator:
+    return GeneratorHallucinator(
+        generator, rng=torch.Generator().manual_seed(2), share_latent=share_latent, chunk=chunk
+    )
 
 
 def test_every_frame_is_painted_and_the_given_ones_stay(
@@ -75,7 +78,9 @@ def test_random_flags_replace_those_of_the_poses_alike_in_all_images_of_a_row() 
 
     pose = torch.rand(64, 2, 4)
     pose[..., 3] = 1
-    RandomFlags(spy, rng=torch.Generator().manual_seed(0))(torch.zeros(64, 2, 1, 1, 3), pose, pose[:, :1])
+    painter = RandomFlags(spy, poses=PlanarPoses(flags=("held",)), rng=torch.Generator().manual_seed(0))
+    painter(torch.zeros(64, 2, 1, 1, 3), pose, pose[:, :1])
+    assert (pose[..., 3] == 1).all()
     assert torch.equal(seen[0][..., :3], pose[..., :3])
     flags = seen[0][..., 3]
     assert torch.equal(flags[:, 0], flags[:, 1])
@@ -101,6 +106,37 @@ def test_the_networks_mode_is_found_again_but_never_used(rows: tuple[Tensor, ...
     for name, tensor in generator.state_dict().items():
         assert torch.equal(tensor, state[name]), name
     assert not first.requires_grad
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_images_of_any_shape_are_painted(shape: str) -> None:
+    image_shape, frame_stack = SHAPES[shape]
+    painter = hallucinator(vivid_generator(image_shape=image_shape, frame_stack=frame_stack))
+    pixels = torch.zeros(ROWS, FRAMES, *image_shape, dtype=torch.uint8)
+    painted = painter(pixels, torch.zeros(ROWS, FRAMES, 3), torch.ones(ROWS, 1, 3))
+    assert painted.shape == pixels.shape
+    assert painter.image_shape == image_shape
+
+
+@pytest.mark.parametrize("shape", [(3, 64, 64), (84, 84, 3), (64, 64, 12)])
+def test_images_of_another_shape_than_the_generators_are_refused(
+    generator: CoordinateGenerator, shape: tuple[int, int, int]
+) -> None:
+    pixels = torch.zeros(ROWS, FRAMES, *shape, dtype=torch.uint8)
+    with pytest.raises(ValueError, match=rf"pixels are torch.uint8 \{list(pixels.shape)}.*\[N, F, 64, 64, 3\]"):
+        hallucinator(generator)(pixels, torch.zeros(ROWS, FRAMES, 3), torch.ones(ROWS, 1, 3))
+
+
+def test_float_images_are_refused(generator: CoordinateGenerator) -> None:
+    pixels = torch.zeros(ROWS, FRAMES, 64, 64, 3)
+    with pytest.raises(ValueError, match=r"pixels are torch\.float32"):
+        hallucinator(generator)(pixels, torch.zeros(ROWS, FRAMES, 3), torch.ones(ROWS, 1, 3))
+
+
+def test_random_flags_paint_the_images_of_their_hallucinator(generator: CoordinateGenerator) -> None:
+    rng = torch.Generator()
+    assert RandomFlags(hallucinator(generator), poses=PlanarPoses(), rng=rng).image_shape == (64, 64, 3)
+    assert RandomFlags(lambda pixels, pose, goal: pixels, poses=PlanarPoses(), rng=rng).image_shape is None
 
 
 def test_no_rows_are_no_trouble(generator: CoordinateGenerator, rows: tuple[Tensor, ...]) -> None:

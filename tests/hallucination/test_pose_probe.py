@@ -1,24 +1,17 @@
-import math
-
+import pytest
 import torch
 
-from halgan_rl.hallucination.judging.pose_probe import polar_goal, train_probe
-from tests.synthetic import near_goal
+from halgan_rl.hallucination.judging.pose_probe import PoseProbe, probe_errors, train_probe
+from halgan_rl.poses import PlanarPoses
+from tests.synthetic import SHAPES, near_goal
 
-
-def test_the_goal_stands_ahead_of_its_goal_pose() -> None:
-    pose = torch.tensor([1.0, 0.0, math.pi / 2])
-    goal_pose = torch.tensor([1.0, 0.5, math.pi])
-    bearing, distance = polar_goal(pose, goal_pose, goal_offset=0.5).tolist()
-    assert math.isclose(bearing, math.pi / 4, rel_tol=1e-5)
-    assert math.isclose(distance, math.hypot(0.5, 0.5), rel_tol=1e-5)
+AHEAD = PlanarPoses(goal_offsets=(0.3,))
 
 
 def test_a_probe_learns_where_the_goal_is_from_frames_it_has_not_seen() -> None:
     torch.manual_seed(0)
-    offset = 0.3
     data, held_out = (near_goal(512, seed=seed) for seed in (0, 1))
-    polar, truth = (polar_goal(part["pose"], part["goal_pose"], goal_offset=offset) for part in (data, held_out))
+    polar, truth = (AHEAD.goal_polar(part["pose"], part["goal_pose"]) for part in (data, held_out))
     probe = train_probe(data["pixels"], polar, rng=torch.Generator().manual_seed(0), steps=300)
     with torch.no_grad():
         error = (probe(held_out["pixels"]) - truth).abs().mean(0)
@@ -28,3 +21,28 @@ def test_a_probe_learns_where_the_goal_is_from_frames_it_has_not_seen() -> None:
     with torch.no_grad():
         bearing = probe(mirrored)[:, 0]
     assert torch.corrcoef(torch.stack([bearing, -truth[:, 0]]))[0, 1] > 0.9
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_probe_takes_images_of_any_shape(shape: str) -> None:
+    image_shape, frame_stack = SHAPES[shape]
+    pixels = near_goal(16, image_shape=image_shape, frame_stack=frame_stack)["pixels"]
+    probe = train_probe(pixels, torch.rand(16, 2) + 0.1, rng=torch.Generator().manual_seed(0), steps=1, batch_size=4)
+    assert probe.read(pixels).shape == (16, 2)
+
+
+def test_a_probe_is_not_trained_on_nothing() -> None:
+    with pytest.raises(ValueError, match=r"\[0, 64, 64, 3\].*with the goal in view"):
+        train_probe(torch.zeros(0, 64, 64, 3, dtype=torch.uint8), torch.zeros(0, 2), rng=torch.Generator())
+
+
+def test_errors_are_those_of_bearing_and_distance_and_their_ratio() -> None:
+    probe = PoseProbe((16, 16, 1))
+    probe.read = lambda pixels, **_: pixels  # type: ignore[method-assign, misc]
+    truth = torch.tensor([[0.0, 1.0], [0.1, 2.0]])
+    images = {"real": truth + torch.tensor([0.1, 0.2]), "hallucinated": truth - torch.tensor([0.2, 0.2])}
+    errors = probe_errors(probe, truth, images)
+    assert errors["real"]["bearing_degrees"] == pytest.approx(5.7296, rel=1e-4)
+    assert errors["hallucinated"]["distance_metres"] == pytest.approx(0.2, rel=1e-5)
+    assert errors["ratio"] == {"bearing": pytest.approx(2), "distance": pytest.approx(1)}
+    assert errors["frames"] == 2

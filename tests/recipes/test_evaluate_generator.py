@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from recipes import evaluate_halgan
-from recipes.evaluate_halgan import Config, main
+from recipes import evaluate_generator
+from recipes.evaluate_generator import Config, main
 
 TINY = Config(frames=100, probe_frames=150, probe_steps=60)
 
@@ -33,8 +33,8 @@ def test_goals_that_never_stay_in_view_have_no_scatter_and_all_else(tmp_path: Pa
     assert report["no_op"]["out_of_view"] < 1
 
 
-def test_nobody_s_painting_is_no_overlap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(evaluate_halgan, "GanHallucinator", lambda *_, **__: lambda pixels, pose, goal: pixels)
+def test_nothing_painted_is_no_overlap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(evaluate_generator, "GeneratorHallucinator", lambda *_, **__: lambda pixels, pose, goal: pixels)
     main(dataclasses.replace(TINY, out=tmp_path / "report"))
     report = json.loads((tmp_path / "report" / "fidelity.json").read_text())
     assert report["mask"]["all"]["overlap"] == 0

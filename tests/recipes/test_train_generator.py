@@ -4,35 +4,46 @@ import dataclasses
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-import halgan_envs
 import pytest
 import torch
 from safetensors.torch import load_file
 
+import halgan_envs
+from halgan_rl.experiment import generator_run
+from halgan_rl.experiment.domain import Domain
+from halgan_rl.experiment.generator_run import COLUMNS, GeneratorRunConfig
 from halgan_rl.experiment.presets import parse_config
 from halgan_rl.experiment.run_folder import read_metrics
-from halgan_rl.hallucination.hallucinators import GanHallucinator
-from halgan_rl.hallucination.training.adversarial import GanSettings
+from halgan_rl.hallucination.generators.base import HallucinationGenerator
+from halgan_rl.hallucination.generators.config import GeneratorConfig
+from halgan_rl.hallucination.hallucinators import GeneratorHallucinator
+from halgan_rl.hallucination.training.adversarial import AdversarialConfig
+from halgan_rl.hallucination.training.matte_regression import MatteConfig
 from halgan_rl.hallucination.weights import load_generator
-from recipes.train_halgan import PRESETS, Config, main
+from recipes import train_generator
+from recipes.train_generator import PRESETS, Config, main
+from tests import synthetic
 
-TINY = dataclasses.replace(
-    Config(),
-    iterations=2,
-    warm_start_steps=2,
+TINY = Config(
     near_goal_frames=40,
     failed_frames=40,
     held_out_frames=4,
     evaluate_every=2,
-    game=GanSettings(batch_size=4, critic_steps=1, mirror=True, bandwidth=0.1),
+    mattes=MatteConfig(steps=2),
+    adversarial=AdversarialConfig(steps=2, batch_size=4, critic_steps=1, bandwidth=0.1),
 )
+
+
+def load(run: Path) -> HallucinationGenerator:
+    domain = halgan_envs.domain("navigate-2m")
+    return load_generator(run / "generator.safetensors", fingerprint=domain.fingerprint, poses=domain.poses)
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("runs") / "halgan"
+    out = tmp_path_factory.mktemp("runs") / "generator"
     main(dataclasses.replace(TINY, out=out))
     return out
 
@@ -47,27 +58,31 @@ def test_everything_promised_is_written(run: Path) -> None:
     }
     metrics = read_metrics(run / "metrics.csv")
     assert metrics["steps"] == [2, 4]
-    assert not math.isnan(metrics["game/critic_distance"][-1])
+    assert not math.isnan(metrics["adversarial/critic_distance"][-1])
     manifest = json.loads((run / "generator.json").read_text())
     assert manifest["config"]["near_goal_frames"] == 40
     assert {"command", "golden_frame", "mujoco", "versions"} <= set(manifest)
 
 
 def test_the_weights_paint(run: Path) -> None:
-    generator = load_generator(run / "generator.safetensors", expected=halgan_envs.fingerprint("navigate-2m"))
-    hallucinate = GanHallucinator(generator, rng=torch.Generator().manual_seed(0))
+    hallucinate = GeneratorHallucinator(load(run), rng=torch.Generator().manual_seed(0))
     pixels = torch.zeros(1, 2, 64, 64, 3, dtype=torch.uint8)
     assert hallucinate(pixels, torch.zeros(1, 2, 3), torch.ones(1, 1, 3)).shape == pixels.shape
 
 
 def test_a_run_repeats_itself_and_every_weight_is_trained(run: Path, tmp_path: Path) -> None:
     weights = {"first": load_file(run / "generator.safetensors")}
-    for name, changes in {"again": {}, "warm": {"iterations": 0}, "seed": {"seed": 1}}.items():
-        main(dataclasses.replace(TINY, out=tmp_path / name, **changes))
+    changes: dict[str, dict[str, Any]] = {
+        "again": {},
+        "regression": {"adversarial": dataclasses.replace(TINY.adversarial, steps=0)},
+        "seed": {"seed": 1},
+    }
+    for name, change in changes.items():
+        main(dataclasses.replace(TINY, out=tmp_path / name, **change))
         weights[name] = load_file(tmp_path / name / "generator.safetensors")
     trained = [name for name in weights["first"] if not name.startswith("encoding")]
     assert all(torch.equal(weights["first"][name], weights["again"][name]) for name in weights["first"])
-    for other in ("warm", "seed"):
+    for other in ("regression", "seed"):
         assert not any(torch.equal(weights["first"][name], weights[other][name]) for name in trained), other
 
 
@@ -75,18 +90,52 @@ def test_training_ends_when_its_minutes_are_over_and_keeps_what_it_has(tmp_path:
     main(dataclasses.replace(TINY, out=tmp_path / "run", minutes=1e-6, evaluate_every=100))
     metrics = read_metrics(tmp_path / "run" / "metrics.csv")
     assert metrics["steps"] == [1]
-    load_generator(tmp_path / "run" / "generator.safetensors", expected=halgan_envs.fingerprint("navigate-2m"))
+    load(tmp_path / "run")
 
 
 @pytest.mark.parametrize("composition", ["dimming", "difference"])
-def test_the_papers_generator_composes_as_it_is_told(tmp_path: Path, composition: str) -> None:
-    changes = {"generator": "paper", "warm_start_steps": 0, "iterations": 1, "composition": composition}
-    main(dataclasses.replace(TINY, out=tmp_path / "run", **changes))  # type: ignore[arg-type]
-    generator = load_generator(
-        tmp_path / "run" / "generator.safetensors", expected=halgan_envs.fingerprint("navigate-2m")
+def test_the_papers_generator_composes_as_configured(
+    tmp_path: Path, composition: Literal["dimming", "difference"]
+) -> None:
+    config = dataclasses.replace(
+        TINY,
+        out=tmp_path / "run",
+        mattes=MatteConfig(steps=0),
+        generator=GeneratorConfig(kind="paper", composition=composition),
     )
+    main(config)
     grey = torch.full((1, 3, 64, 64), 0.5)
-    assert torch.equal(generator.compose(grey, torch.zeros_like(grey)), grey) == (composition == "difference")
+    composed = load(tmp_path / "run").compose(grey, torch.zeros_like(grey))
+    assert torch.equal(composed, grey) == (composition == "difference")
+
+
+@pytest.mark.parametrize(("environment", "noise"), [("pebble", 0.05), ("navigate-2m", 0.7)])
+def test_latents_have_as_much_noise_as_suits_the_environment(
+    environment: str, noise: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+
+    def spy(config: Config, *_: Any, **__: Any) -> dict[str, float]:
+        seen.append(config.latent_noise)
+        return dict.fromkeys(COLUMNS, 0.0)
+
+    monkeypatch.setattr(train_generator, "run", spy)
+    monkeypatch.setattr(train_generator, "collect", lambda *_: {})
+    monkeypatch.setattr(train_generator, "render_truth", lambda *_: {})
+    main(dataclasses.replace(TINY, environment=environment, out=tmp_path / "run"))
+    main(dataclasses.replace(TINY, environment=environment, out=tmp_path / "run", latent_noise=0.3))
+    assert seen == [noise, 0.3]
+
+
+def test_frames_of_any_shape_without_a_simulator_make_a_generator(tmp_path: Path) -> None:
+    """A user's domain: no truth to compare with, no fingerprint, grey frames of 48 x 32 pixels."""
+    shape = (48, 32, 1)
+    domain = Domain("mine", make=None, action_spec=None, image_shape=shape)  # type: ignore[arg-type]
+    config = GeneratorRunConfig(environment="mine", out=tmp_path / "run", mattes=MatteConfig(steps=2, batch_size=4))
+    data = {"near_goal": synthetic.near_goal(16, image_shape=shape), "failed": synthetic.failed(16, image_shape=shape)}
+    assert math.isnan(generator_run.run(config, domain, **data)["truth/mask_overlap"])
+    path = tmp_path / "run" / "generator.safetensors"
+    assert load_generator(path, fingerprint={}, poses=domain.poses, image_shape=shape).image_shape == shape
 
 
 def test_a_folder_that_holds_a_run_is_refused_first(tmp_path: Path) -> None:
@@ -96,7 +145,7 @@ def test_a_folder_that_holds_a_run_is_refused_first(tmp_path: Path) -> None:
     assert (tmp_path / "metrics.csv").read_text() == "precious"
 
 
-@pytest.mark.parametrize("args", [["--no-such-flag", "1"], ["--generator", "moon"], ["--preset", "nature"]])
+@pytest.mark.parametrize("args", [["--no-such-flag", "1"], ["--generator.kind", "moon"], ["--preset", "nature"]])
 def test_unknown_flags_and_names_are_refused(args: list[str]) -> None:
     with pytest.raises(SystemExit):
         parse_config(PRESETS, args, description=None)
@@ -109,16 +158,25 @@ def test_an_unknown_environment_is_refused_with_those_there_are_before_the_folde
 
 
 @pytest.mark.parametrize(
-    "changes",
-    [{"near_goal_frames": 0}, {"iterations": -1}, {"minutes": 0}, {"generator": "paper"}, {"latent_noise": 2.0}],
+    ("changes", "message"),
+    [
+        ({"near_goal_frames": 0}, "near_goal_frames"),
+        ({"steps_before_goal": -1}, "steps_before_goal"),
+        ({"minutes": 0}, "minutes"),
+        ({"evaluate_every": 0}, "evaluate_every"),
+        ({"latent_noise": 2.0}, "latent_noise"),
+        ({"generator": GeneratorConfig(kind="paper")}, "--mattes.steps 0"),
+        ({"mattes": MatteConfig(steps=0)}, "nothing to train"),
+    ],
 )
-def test_values_that_cannot_work_are_refused(changes: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=next(iter(changes))):
+def test_values_that_cannot_work_are_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         dataclasses.replace(Config(), **changes)
 
 
 def test_the_preset_chooses_the_defaults_and_flags_win() -> None:
     assert parse_config(PRESETS, [], description=None) == PRESETS["default"]
-    config = parse_config(PRESETS, ["--preset", "paper", "--game.critic-steps", "2"], description=None)
+    config = parse_config(PRESETS, ["--preset", "paper", "--adversarial.critic-steps", "2"], description=None)
     paper = PRESETS["paper"]
-    assert config == dataclasses.replace(paper, game=dataclasses.replace(paper.game, critic_steps=2))
+    adversarial = dataclasses.replace(paper.adversarial, critic_steps=2)
+    assert config == dataclasses.replace(paper, adversarial=adversarial)

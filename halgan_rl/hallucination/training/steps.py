@@ -7,7 +7,7 @@ import torch
 
 from halgan_rl.hallucination.generators.base import HallucinationGenerator
 from halgan_rl.hallucination.training.adversarial import AdversarialConfig, AdversarialTrainer
-from halgan_rl.hallucination.training.data import Frames
+from halgan_rl.hallucination.training.data import Frames, check_data
 from halgan_rl.hallucination.training.discriminator import Discriminator
 from halgan_rl.hallucination.training.matte_regression import MatteConfig, fit_mattes
 from halgan_rl.poses import PlanarPoses
@@ -31,6 +31,7 @@ def train_generator(
     mattes: MatteConfig,
     adversarial: AdversarialConfig,
     poses: PlanarPoses = PlanarPoses(),
+    standardise: bool = True,
     mirror: bool = True,
     latent_noise: float = 0.7,
     discriminator_stride: Literal[1, 2] = 1,
@@ -47,6 +48,7 @@ def train_generator(
         mattes: matte regression; with steps it needs a ``CoordinateGenerator``.
         adversarial: adversarial training, after it.
         poses: which entries of a pose are flags.
+        standardise: whether to scale the configuration's features to mean 0 and variance 1 first.
         mirror: whether half of the frames are mirrored left to right.
         latent_noise: fraction of noise in the latents of matte regression.
         discriminator_stride: of its first convolution.
@@ -58,6 +60,9 @@ def train_generator(
         KeyError: if an entry of the frames is missing.
         ValueError: if frames or poses are other than the generator's.
     """
+    check_data(generator, near_goal, failed, poses)
+    if standardise:
+        generator.encoding.standardise(generator.encoding.labels(near_goal["pose"], near_goal["goal_pose"]))
     data: dict[str, Frames] = {"near_goal": near_goal, "failed": failed}
     if mattes.steps:
         losses = fit_mattes(
