@@ -18,10 +18,10 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from benchmarks.plain_vision import PlainVision
+from benchmarks.plain_encoder import PlainEncoder
 from benchmarks.rows import EPISODE, channels_first
-from halgan_rl.experiment.config import HindsightConfig
-from halgan_rl.hallucination.generators.paper import LEAK
+from halgan_rl.agents.agent import AgentConfig
+from halgan_rl.agents.encoder import LEAK
 
 ACTIONS = spaces.Box(-1, 1, (2,), np.float32)
 POSES = spaces.Box(-np.inf, np.inf, (3,), np.float32)
@@ -119,11 +119,11 @@ def nbytes(buffer: ReplayBuffer) -> int:
 
 
 class Features(BaseFeaturesExtractor):
-    """What our agents see with, of plain convolutions."""
+    """The encoder of our agents, of plain convolutions."""
 
     def __init__(self, observation_space: spaces.Box, downsample: str) -> None:
         super().__init__(observation_space, features_dim=512)
-        self.layers = PlainVision(downsample).layers
+        self.layers = PlainEncoder(downsample).layers
 
     def forward(self, observations: Tensor) -> Tensor:
         """Return features ``[N, 512]``."""
@@ -131,7 +131,7 @@ class Features(BaseFeaturesExtractor):
 
 
 def make_model(
-    algorithm: type[OffPolicyAlgorithm], actions: spaces.Space, rows: TensorDict, config: HindsightConfig, rate: float
+    algorithm: type[OffPolicyAlgorithm], actions: spaces.Space, rows: TensorDict, config: AgentConfig, rate: float
 ) -> OffPolicyAlgorithm:
     """Return an algorithm with our networks, on a buffer filled with rows of images 64x64."""
     model = algorithm(
@@ -139,7 +139,7 @@ def make_model(
         DummyVecEnv([partial(Still, images(64), actions)]),
         learning_rate=rate,
         buffer_size=len(rows),
-        tau=config.target_rate,
+        tau=config.tau,
         gamma=config.discount,
         device="cpu",
         policy_kwargs={
@@ -158,10 +158,12 @@ Updates = Callable[[int], object]
 """Makes so many updates."""
 
 
-def make_ddpg_updates(rows: TensorDict, config: HindsightConfig, rate: float) -> tuple[Updates, tuple[int, ...]]:
+def make_ddpg_updates(
+    rows: TensorDict, config: AgentConfig, rate: float, batch_size: int
+) -> tuple[Updates, tuple[int, ...]]:
     """Return updates of DDPG, and the numbers of parameters of actor and critic, each with its own convolutions."""
     model = make_model(DDPG, ACTIONS, rows, config, rate)
-    return partial(model.train, batch_size=config.batch_size), _counts(model.actor, model.critic)
+    return partial(model.train, batch_size=batch_size), _counts(model.actor, model.critic)
 
 
 class DoubleTarget(nn.Module):
@@ -181,7 +183,7 @@ class DoubleTarget(nn.Module):
 
 
 def make_dqn_updates(
-    rows: TensorDict, config: HindsightConfig, rate: float, *, double: bool
+    rows: TensorDict, config: AgentConfig, rate: float, batch_size: int, *, double: bool
 ) -> tuple[Updates, tuple[int, ...]]:
     """Return updates of DQN and of its target, and the number of parameters; the rows' actions are one-hot."""
     choices = spaces.Discrete(rows["action"].shape[-1])
@@ -193,7 +195,7 @@ def make_dqn_updates(
 
     def run(count: int) -> None:
         for _ in range(count):
-            model.train(gradient_steps=1, batch_size=config.batch_size)
+            model.train(gradient_steps=1, batch_size=batch_size)
             polyak_update(model.q_net.parameters(), target.parameters(), model.tau)
 
     return run, _counts(model.q_net)

@@ -5,16 +5,16 @@ Usage::
     python -m benchmarks.updates
 
 Ours is the recipe's update: sampling from a ``FrameStorage``, the batches of a round at once; TorchRL's loss with
-clipped targets (and, in DDPG, the price on the actor's pre-activations) and shared passes through the convolutions; one
-fused Adam. Stable-Baselines3's is ``DDPG.train``, with all gradient steps of a round, or ``DQN.train``, with plain
+clipped targets (and, in DDPG, the penalty on the actor's pre-activations) and shared passes through the convolutions;
+one fused Adam. Stable-Baselines3's is ``DDPG.train``, with all gradient steps of a round, or ``DQN.train``, with plain
 convolutions as features extractor, in DDPG one for each of actor and critic (it has one learning rate for both).
 TorchRL's is ``DDPGLoss`` or ``DQNLoss``, an Adam for each network and ``SoftUpdate`` on a ``LazyTensorStorage`` of
 images channels first. Peers have networks of plain layers that compute the same, in PyTorch's default memory format;
 TorchRL's in ``channels_last`` as well. The numbers of parameters are compared before measuring. One thread, processor
 time in alternating rounds: medians, and medians of the rounds' ratios.
 
-Stable-Baselines3's DQN is not double: it does not ask the online network about next frames, one forward pass less. So
-both it and ours are measured twice: double, for which its target network is wrapped in one that asks, and not double.
+Stable-Baselines3's DQN is not double: its online network does not see next frames, one forward pass less. So both it
+and ours are measured twice: double, for which its target network is wrapped in one that runs both, and not double.
 Its ``train`` leaves the target network to the steps in the environment; here the target network follows at each update,
 as in the others.
 
@@ -40,24 +40,27 @@ from torchrl.data import Bounded, LazyTensorStorage, OneHot, TensorDictReplayBuf
 from torchrl.objectives import DDPGLoss, DQNLoss, LossModule, SoftUpdate, ValueEstimators
 
 from benchmarks import sb3_peers
-from benchmarks.plain_vision import PlainVision
+from benchmarks.plain_encoder import PlainEncoder
 from benchmarks.rounds import ratio, seconds_a_call, take_turns, warm_heap
 from benchmarks.rows import Rows, channels_first, plain
 from benchmarks.tables import Table, report
-from halgan_rl.agents import ddpg, ddqn
-from halgan_rl.agents.fast_cpu.block_convolutions import Downsample
-from halgan_rl.agents.networks import Actor, Critic, QNetwork, Vision, greedy_policy, see
-from halgan_rl.experiment.config import HindsightConfig
-from halgan_rl.experiment.run import make_buffer
-from halgan_rl.training.loop import Agent, draw_batches
+from halgan_rl.agents import registry
+from halgan_rl.agents.agent import Agent, AgentConfig
+from halgan_rl.agents.ddpg import Actor, Critic, DDPGConfig
+from halgan_rl.agents.ddqn import DDQNConfig, QNetwork, greedy_policy
+from halgan_rl.agents.encoder import Downsample
+from halgan_rl.agents.fast_cpu import accelerate
+from halgan_rl.agents.fast_cpu.block_encoder import BlockEncoder, encode_together
+from halgan_rl.replay.frame_storage import FrameStorage
+from halgan_rl.training.loop import draw_batches
 from recipes import ddpg_navigate, ddqn_pebble
 
 Updates = Callable[[int], object]
 """Makes so many updates."""
 Counts = tuple[int, ...]
 """Numbers of parameters of actor and critic, or of the one network of action values."""
-Variant = Callable[[Any, TensorDict], tuple[Updates, Counts]]
-"""Makes updates for a recipe's configuration and the rows of a buffer."""
+Variant = Callable[[Any, TensorDict, int], tuple[Updates, Counts]]
+"""Makes updates for an agent's configuration, the rows of a buffer, and the size of batches."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,49 +80,51 @@ class Benchmark:
 
 
 def ours(
-    make_agent: Callable[[Any, TensorSpec], Agent], actions: TensorSpec, config: HindsightConfig, rows: TensorDict
+    actions: TensorSpec, config: AgentConfig, rows: TensorDict, batch_size: int, *, double: bool = True
 ) -> tuple[Updates, Counts]:
-    """Return the recipe's updates, and the numbers of parameters."""
-    buffer = make_buffer(config, None)
+    """Returns the recipe's updates, and the numbers of parameters."""
+    buffer = TensorDictReplayBuffer(storage=FrameStorage(len(rows)), generator=torch.Generator().manual_seed(0))
     buffer.extend(plain(rows))
-    agent = make_agent(config, actions)
+    agent = make_agent(actions, config, double=double)
 
     def run(count: int) -> None:
-        for batch in draw_batches(buffer, count, config.batch_size):
+        for batch in draw_batches(buffer, count, batch_size):
             agent.update(batch)
 
     return run, count_parameters(agent.loss)
+
+
+def make_agent(actions: TensorSpec, config: AgentConfig, *, double: bool = True) -> Agent:
+    """Returns the recipe's agent, fast on a CPU, with targets that are double or not."""
+    agent = registry.make_agent(config, action_spec=actions, image_shape=(64, 64, 3))
+    accelerate(agent)
+    if not double:
+        agent.loss.double_dqn = False
+    return agent
 
 
 Passes = Sequence[tuple[int, bool]]
 """Passes through convolutions: how many networks share one, and whether they learn by it."""
 
 
-def convolutions(config: HindsightConfig, rows: TensorDict, passes: Passes) -> Updates:
-    """Return the convolutions of our update: forward, and back where they learn."""
-    pixels = rows["pixels"][: config.batch_size]
-    networks = [[Vision(config.downsample) for _ in range(count)] for count, _ in passes]
+def convolutions(config: AgentConfig, rows: TensorDict, batch_size: int, passes: Passes) -> Updates:
+    """Returns the convolutions of our update: forward, and back where they learn."""
+    pixels = rows["pixels"][:batch_size]
+    networks = [[BlockEncoder(downsample=config.downsample) for _ in range(count)] for count, _ in passes]
 
     def run(count: int) -> None:
-        for visions, (_, learns) in count * list(zip(networks, passes, strict=True)):
+        for encoders, (_, learns) in count * list(zip(networks, passes, strict=True)):
             with torch.set_grad_enabled(learns):
-                features = see(pixels, visions)
+                features = encode_together(pixels, encoders)
             if learns:
                 torch.autograd.backward(features, [torch.ones_like(seen) for seen in features])
 
     return run
 
 
-def make_single_dqn(config: ddqn.DDQNConfig, actions: TensorSpec) -> Agent:
-    """Return the recipe's agent, with targets that are not double."""
-    agent = ddqn.make_agent(config, actions)
-    agent.loss.double_dqn = False
-    return agent
-
-
-def with_plain_vision(network: nn.Module, config: HindsightConfig, memory_format: torch.memory_format) -> nn.Module:
-    """Return one of our networks, changed to images channels first and plain convolutions."""
-    network.vision = PlainVision(config.downsample, memory_format)
+def with_plain_encoder(network: nn.Module, config: AgentConfig, memory_format: torch.memory_format) -> nn.Module:
+    """Returns one of our networks, changed to images channels first and plain convolutions."""
+    network.encoder = PlainEncoder(config.downsample, memory_format)
     return network
 
 
@@ -127,9 +132,9 @@ LearningRates = list[tuple[TensorDict, float]]
 """Parameters, and the learning rate of their Adam."""
 
 
-def torchrl_ddpg(config: ddpg.DDPGConfig, memory_format: torch.memory_format) -> tuple[LossModule, LearningRates]:
-    """Return TorchRL's loss on our actor and critic, channels first."""
-    actor, critic = (with_plain_vision(network, config, memory_format) for network in (Actor(), Critic()))
+def torchrl_ddpg(config: DDPGConfig, memory_format: torch.memory_format) -> tuple[LossModule, LearningRates]:
+    """Returns TorchRL's loss on our actor and critic, channels first."""
+    actor, critic = (with_plain_encoder(network, config, memory_format) for network in (Actor(), Critic()))
     loss = DDPGLoss(
         TensorDictModule(nn.Sequential(actor, nn.Tanh()), in_keys=["pixels"], out_keys=["action"]),
         TensorDictModule(critic, in_keys=["pixels", "action"], out_keys=["state_action_value"]),
@@ -140,9 +145,9 @@ def torchrl_ddpg(config: ddpg.DDPGConfig, memory_format: torch.memory_format) ->
     return loss, list(zip((loss.actor_network_params, loss.value_network_params), rates, strict=True))
 
 
-def torchrl_ddqn(config: ddqn.DDQNConfig, memory_format: torch.memory_format) -> tuple[LossModule, LearningRates]:
-    """Return TorchRL's loss on our network of action values, channels first."""
-    values = greedy_policy(with_plain_vision(QNetwork(), config, memory_format))
+def torchrl_ddqn(config: DDQNConfig, memory_format: torch.memory_format) -> tuple[LossModule, LearningRates]:
+    """Returns TorchRL's loss on our network of action values, channels first."""
+    values = greedy_policy(with_plain_encoder(QNetwork(), config, memory_format))
     loss = DQNLoss(values, delay_value=True, double_dqn=True, action_space="one_hot")
     return loss, [(loss.value_network_params, config.learning_rate)]
 
@@ -150,16 +155,17 @@ def torchrl_ddqn(config: ddqn.DDQNConfig, memory_format: torch.memory_format) ->
 def torchrl_loop(
     make_loss: Callable[[Any, torch.memory_format], tuple[LossModule, LearningRates]],
     memory_format: torch.memory_format,
-    config: HindsightConfig,
+    config: AgentConfig,
     rows: TensorDict,
+    batch_size: int,
 ) -> tuple[Updates, Counts]:
-    """Return TorchRL's plain updates, and the numbers of parameters."""
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(len(rows)), batch_size=config.batch_size)
+    """Returns TorchRL's plain updates, and the numbers of parameters."""
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(len(rows)), batch_size=batch_size)
     buffer.extend(plain(rows).update({"pixels": channels_first(rows["pixels"])}).update(_next_channels_first(rows)))
     loss, rates = make_loss(config, memory_format)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=config.discount)
     optimizers = [torch.optim.Adam(parameters.values(True, True), lr=rate) for parameters, rate in rates]
-    target_updater = SoftUpdate(loss, tau=config.target_rate)
+    target_updater = SoftUpdate(loss, tau=config.tau)
 
     def run(count: int) -> None:
         for _ in range(count):
@@ -183,18 +189,18 @@ def _torchrl_update(
     target_updater.step()
 
 
-def sb3_ddpg(config: ddpg.DDPGConfig, rows: TensorDict) -> tuple[Updates, Counts]:
-    """Return Stable-Baselines3's updates, and the numbers of parameters."""
-    return sb3_peers.make_ddpg_updates(rows, config, config.critic_learning_rate)
+def sb3_ddpg(config: DDPGConfig, rows: TensorDict, batch_size: int) -> tuple[Updates, Counts]:
+    """Returns Stable-Baselines3's updates, and the numbers of parameters."""
+    return sb3_peers.make_ddpg_updates(rows, config, config.critic_learning_rate, batch_size)
 
 
-def sb3_dqn(config: ddqn.DDQNConfig, rows: TensorDict, *, double: bool) -> tuple[Updates, Counts]:
-    """Return Stable-Baselines3's updates, and the numbers of parameters."""
-    return sb3_peers.make_dqn_updates(rows, config, config.learning_rate, double=double)
+def sb3_dqn(config: DDQNConfig, rows: TensorDict, batch_size: int, *, double: bool) -> tuple[Updates, Counts]:
+    """Returns Stable-Baselines3's updates, and the numbers of parameters."""
+    return sb3_peers.make_dqn_updates(rows, config, config.learning_rate, batch_size, double=double)
 
 
 def count_parameters(loss: LossModule) -> Counts:
-    """Return the number of parameters of each network that a loss trains."""
+    """Returns the number of parameters of each network that a loss trains."""
     networks = [getattr(loss, f"{name}_network_params", None) for name in ("actor", "value")]
     return tuple(sum(p.numel() for p in network.values(True, True)) for network in networks if network is not None)
 
@@ -204,13 +210,13 @@ class Algorithm:
     """What is measured of an algorithm.
 
     Attributes:
-        config: the recipe's.
+        config: the recipe's agent.
         actions: of its environment.
         variants: ours and its peers.
         passes: of our updates, under the names by which they are reported.
     """
 
-    config: HindsightConfig
+    config: AgentConfig
     actions: TensorSpec
     variants: Mapping[str, Variant]
     passes: Mapping[str, Passes]
@@ -219,10 +225,10 @@ class Algorithm:
 DRIVE, CHOICE = Bounded(-1.0, 1.0, (2,)), OneHot(4, dtype=torch.int64)
 ALGORITHMS = {
     "DDPG": Algorithm(
-        ddpg_navigate.Config(hindsight="none"),
+        ddpg_navigate.DEFAULT.agent,
         DRIVE,
         {
-            "ours": partial(ours, ddpg.make_agent, DRIVE),
+            "ours": partial(ours, DRIVE),
             "SB3 DDPG.train": sb3_ddpg,
             "torchrl plain loop": partial(torchrl_loop, torchrl_ddpg, torch.contiguous_format),
             "torchrl plain loop, channels_last": partial(torchrl_loop, torchrl_ddpg, torch.channels_last),
@@ -230,11 +236,11 @@ ALGORITHMS = {
         passes={"our convolutions alone": ((2, True), (2, False))},  # actor and critic at s, their targets at s'
     ),
     "DDQN": Algorithm(
-        ddqn_pebble.Config(hindsight="none"),
+        ddqn_pebble.DEFAULT.agent,
         CHOICE,
         {
-            "ours": partial(ours, ddqn.make_agent, CHOICE),
-            "ours, not double": partial(ours, make_single_dqn, CHOICE),
+            "ours": partial(ours, CHOICE),
+            "ours, not double": partial(ours, CHOICE, double=False),
             "SB3 DQN.train, made double": partial(sb3_dqn, double=True),
             "SB3 DQN.train, not double": partial(sb3_dqn, double=False),
             "torchrl plain loop": partial(torchrl_loop, torchrl_ddqn, torch.contiguous_format),
@@ -248,24 +254,25 @@ ALGORITHMS = {
 }
 
 
-def make_updates(algorithm: Algorithm, rows: TensorDict, **changes: Any) -> dict[str, Updates]:
-    """Return the updates of each variant and our convolutions alone; the networks have the same numbers of parameters.
+def make_updates(algorithm: Algorithm, rows: TensorDict, *, batch_size: int = 32, **changes: Any) -> dict[str, Updates]:
+    """Returns the updates of each variant and our convolutions alone; the networks have the same numbers of parameters.
 
     Args:
         algorithm: what to measure.
         rows: what to fill the buffers with; actions are drawn anew.
-        changes: of the recipe's configuration.
+        batch_size: rows an update.
+        changes: of the agent's configuration.
 
     Raises:
         RuntimeError: if the numbers differ.
     """
-    config = dataclasses.replace(algorithm.config, replay_capacity=len(rows), **changes)
+    config = dataclasses.replace(algorithm.config, **changes)
     rows = rows.clone(False).set("action", algorithm.actions.rand((len(rows),)))
-    made = {name: variant(config, rows) for name, variant in algorithm.variants.items()}
+    made = {name: variant(config, rows, batch_size) for name, variant in algorithm.variants.items()}
     counts = {name: parameters for name, (_, parameters) in made.items()}
     if len(set(counts.values())) != 1:
         raise RuntimeError(f"the networks differ, this would compare apples with pears: {counts}")
-    bounds = {name: convolutions(config, rows, passes) for name, passes in algorithm.passes.items()}
+    bounds = {name: convolutions(config, rows, batch_size, passes) for name, passes in algorithm.passes.items()}
     return {name: run for name, (run, _) in made.items()} | bounds
 
 
@@ -274,7 +281,7 @@ Case = tuple[str, str, int, str]
 
 
 def measure(benchmark: Benchmark) -> dict[Case, list[float]]:
-    """Return times of some updates [s], all taken by turns."""
+    """Returns times of some updates [s], all taken by turns."""
     rows = Rows(64).take(benchmark.rows)
     measures = {}
     for (algorithm, made), *options in itertools.product(
@@ -287,12 +294,12 @@ def measure(benchmark: Benchmark) -> dict[Case, list[float]]:
 
 
 def our(name: str) -> str:
-    """Return which of our variants another one is compared with."""
+    """Returns which of our variants another one is compared with."""
     return "ours, not double" if name.endswith("not double") else "ours"
 
 
 def describe(seconds: list[float], updates: int) -> tuple[str, str]:
-    """Return the time of an update [ms], and updates a second, of some rounds' times [s]."""
+    """Returns the time of an update [ms], and updates a second, of some rounds' times [s]."""
     median = statistics.median(seconds)
     return f"{1e3 * median / updates:.1f}", f"{updates / median:.0f}"
 
@@ -304,7 +311,7 @@ HEADER = (
 
 
 def main(benchmark: Benchmark) -> None:
-    """Print and save the table."""
+    """Prints and save the table."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
     torchrl_logger.setLevel("WARNING")

@@ -10,10 +10,11 @@ from benchmarks import replay, sb3_peers, update_cost, updates
 from benchmarks.rounds import ratio, take_turns
 from benchmarks.rows import EPISODE, Rows, channels_first, plain
 from benchmarks.tables import Table, report
-from halgan_rl.agents import ddqn
-from halgan_rl.agents import networks as agents
+from halgan_rl.agents.fast_cpu import block_encoder
 from halgan_rl.agents.fast_cpu.block_convolutions import halve
+from halgan_rl.experiment.presets import changed
 from halgan_rl.replay.frame_storage import FrameStorage
+from halgan_rl.transforms import pipelines
 
 TINY = replay.Benchmark(rounds=1, calls=1)
 
@@ -51,27 +52,26 @@ def test_updates_run_on_networks_of_the_same_size(algorithm):
 
 @pytest.mark.parametrize("algorithm", updates.ALGORITHMS.values(), ids=updates.ALGORITHMS)
 def test_different_networks_are_refused(algorithm):
-    other = {"ours": lambda config, rows: (lambda: None, (1, 2))}
+    other = {"ours": lambda config, rows, batch_size: (lambda: None, (1, 2))}
     changed = dataclasses.replace(algorithm, variants={**algorithm.variants, **other})
     with pytest.raises(RuntimeError, match="the networks differ"):
         updates.make_updates(changed, Rows(64).take(EPISODE))
 
 
-@pytest.mark.parametrize(("make_agent", "passes"), [(ddqn.make_agent, 3), (updates.make_single_dqn, 2)])
-def test_a_double_update_asks_a_network_once_more(make_agent, passes, monkeypatch):
-    config = dataclasses.replace(updates.ALGORITHMS["DDQN"].config, replay_capacity=EPISODE)
+@pytest.mark.parametrize(("double", "passes"), [(True, 3), (False, 2)])
+def test_a_double_update_runs_a_network_once_more(double, passes, monkeypatch):
     rows = Rows(64).take(EPISODE)
     rows["action"] = updates.CHOICE.rand((EPISODE,))
-    run, _ = updates.ours(make_agent, updates.CHOICE, config, rows)
-    asked = []
+    run, _ = updates.ours(updates.CHOICE, updates.ALGORITHMS["DDQN"].config, rows, 32, double=double)
+    passed = []
 
     def spy(images, networks, *how):
-        asked.extend(networks)
+        passed.extend(networks)
         return halve(images, networks, *how)
 
-    monkeypatch.setattr(agents, "halve", spy)
+    monkeypatch.setattr(block_encoder, "halve", spy)
     run(1)
-    assert len(asked) == passes
+    assert len(passed) == passes
 
 
 def test_a_peers_target_made_double_values_what_the_network_chooses():
@@ -82,7 +82,7 @@ def test_a_peers_target_made_double_values_what_the_network_chooses():
 
 @pytest.mark.parametrize(("double", "asked"), [(True, 2), (False, 1)])
 def test_a_peers_target_network_follows_and_is_double_if_asked(double, asked, monkeypatch):
-    config = dataclasses.replace(updates.ALGORITHMS["DDQN"].config, batch_size=4)
+    config = updates.ALGORITHMS["DDQN"].config
     rows = Rows(64).take(EPISODE)
     rows["action"] = updates.CHOICE.rand((EPISODE,))
     followed, seen = [], []
@@ -94,7 +94,7 @@ def test_a_peers_target_network_follows_and_is_double_if_asked(double, asked, mo
         return forward(self, observations)
 
     monkeypatch.setattr(sb3_peers.Features, "forward", spy)
-    run, (parameters,) = sb3_peers.make_dqn_updates(rows, config, 1e-3, double=double)
+    run, (parameters,) = sb3_peers.make_dqn_updates(rows, config, 1e-3, 4, double=double)
     run(1)
     assert sorted(seen) == [False] * asked + [True]  # at s', and at s
     ((sources, targets),) = followed
@@ -103,8 +103,8 @@ def test_a_peers_target_network_follows_and_is_double_if_asked(double, asked, mo
 
 
 def test_the_cost_of_hindsight_is_measured_on_the_recipes_update():
-    config = update_cost.Config(hindsight="none", batch_size=4, replay_capacity=EPISODE)
-    update_cost.make_updates(config, Rows(64).take(EPISODE), None, 2)()
+    config = changed(update_cost.DEFAULT, {"training.batch_size": 4})
+    update_cost.make_updates(config, Rows(64).take(EPISODE), pipelines.none(), 2)()
 
 
 def test_rounds_alternate_and_the_first_does_not_count():
