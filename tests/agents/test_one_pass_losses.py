@@ -84,6 +84,11 @@ CASES: dict[str, Callable[[], Pair]] = {
 }
 
 
+def learned(loss: LossModule) -> list[str]:
+    """Returns the names of what is learned; the scale of actions is not."""
+    return sorted(name for name, _ in loss.named_parameters() if not name.startswith("target_"))
+
+
 @pytest.fixture(params=CASES)
 def pair(request: pytest.FixtureRequest) -> Pair:
     """Losses with targets that are another network's, so that it shows which one is used."""
@@ -91,7 +96,7 @@ def pair(request: pytest.FixtureRequest) -> Pair:
     made = CASES[request.param]()
     for loss in (made.ours, made.theirs):
         loss.make_value_estimator(gamma=0.9)
-    others = [value for name, value in sorted(made.ours.state_dict().items()) if name.startswith("target_")]
+    others = [made.ours.state_dict()[f"target_{name}"] for name in learned(made.ours)]
     SoftUpdate(made.theirs, tau=0.1), FusedSoftUpdate(made.ours, tau=0.1)
     for value in others:
         value.add_(0.05 * torch.randn_like(value))
@@ -172,7 +177,7 @@ def targets(loss: Any) -> tuple[torch.nn.Module, ...]:
 
 def test_targets_move_with_the_loss(pair: Pair) -> None:
     moved = pair.ours.double()
-    parameters = {parameter for name, parameter in moved.state_dict().items() if name.startswith("target_")}
+    parameters = [moved.state_dict()[f"target_{name}"] for name in learned(moved)]
     held = [tensor for network in targets(moved) for tensor in network.state_dict().values()]
     assert {tensor.data_ptr() for tensor in held} == {tensor.data_ptr() for tensor in parameters}
 
@@ -190,7 +195,7 @@ def test_the_update_of_targets_follows_where_they_move(pair: Pair, move: Callabl
     updater.step()
     move(pair.ours)
     state = pair.ours.state_dict()
-    sources = {name: value for name, value in state.items() if f"target_{name}" in state}
+    sources = {name: state[name] for name in learned(pair.ours)}
     before = {name: pair.ours.state_dict()[f"target_{name}"].clone() for name in sources}
     for value in sources.values():
         value.add_(1.0)
@@ -211,8 +216,9 @@ COPIES: dict[str, Callable[[LossModule], LossModule]] = {
 def test_a_copy_has_networks_of_its_own(pair: Pair, duplicate: Callable[[LossModule], LossModule]) -> None:
     before = pair.ours(pair.rows.clone())
     copied = duplicate(pair.ours)
-    for tensor in copied.state_dict().values():
-        tensor.add_(0.05 * torch.randn_like(tensor))
+    for name in learned(copied):
+        for tensor in (copied.state_dict()[name], copied.state_dict()[f"target_{name}"]):
+            tensor.add_(0.05 * torch.randn_like(tensor))
     pair.theirs.load_state_dict(copied.state_dict())
     for name, value in pair.theirs(pair.rows.clone()).items():
         torch.testing.assert_close(copied(pair.rows.clone())[name], value, rtol=1e-3, atol=1e-4, msg=name)
