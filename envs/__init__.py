@@ -34,31 +34,13 @@ __all__ = [
     "collect_near_goal",
     "domain",
     "find_pebble",
-    "fingerprint",
-    "goal_offsets",
     "gymnasium_id",
     "make",
     "named",
     "navigate_2m",
     "navigate_4m",
     "pick_and_place_2m",
-    "pose_flags",
     "rendering",
 ]
 
 register_named()
-
-
-def fingerprint(name: str) -> dict[str, str]:
-    """Returns what the images of a named environment depend on, see :class:`halgan_rl.experiment.domain.Domain`."""
-    return dict(domain(name).fingerprint)
-
-
-def goal_offsets(name: str) -> tuple[float, ...]:
-    """Returns how far ahead of a goal pose the goal stands [m], for each setting of the flags."""
-    return domain(name).poses.goal_offsets
-
-
-def pose_flags(name: str) -> tuple[str, ...]:
-    """Returns the names of the entries of a pose after x, y and yaw."""
-    return domain(name).poses.flags

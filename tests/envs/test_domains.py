@@ -28,6 +28,8 @@ def test_the_first_call_builds_one_environment_and_the_second_none(monkeypatch):
     assert first.goal_renderer() is first.goal_renderer()
     assert first.goal_renderer().environment is built[0]
     assert len(built) == 1
+    first.make(seed=3).close()  # a name that a user added is made like the others
+    assert len(built) == 2
     built[0].close()
 
 
