@@ -24,12 +24,12 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-import halgan_envs
 import numpy as np
 import torch
 import tyro
 from torch import Tensor
 
+import halgan_envs
 from halgan_rl.experiment import pictures
 from halgan_rl.experiment.domain import Domain
 from halgan_rl.experiment.run_folder import check_unused, versions, write_json
@@ -192,8 +192,8 @@ def print_table(report: dict[str, Any]) -> None:
         print(f"  {label:22s} {probe[label]['bearing_degrees']:8.2f} ° {probe[label]['distance_metres']:8.3f} m")
     print(f"  {'hallucinated / real':22s} {probe['ratio']['bearing']:8.2f}   {probe['ratio']['distance']:8.2f}")
     print("mask overlap")
-    for label, figures in {**report["mask"], **report["mask_by_distance"], **report["mask_by_bearing"]}.items():
-        print(f"  {label:22s} {figures['overlap']:8.2f}   ({figures['frames']} frames)")
+    for label, band in {**report["mask"], **report["mask_by_distance"], **report["mask_by_bearing"]}.items():
+        print(f"  {label:22s} {band['overlap']:8.2f}   ({band['frames']} frames)")
     print(f"change outside the mask  {no_op['outside_the_mask']:8.2f} / 255")
     print(f"change out of view       {no_op['out_of_view']:8.2f} / 255   ({no_op['frames_out_of_view']} frames)")
     print("goal scatters in the room by", ", ".join(f"{value:.3f} m ({label})" for label, value in scatter.items()))

@@ -44,7 +44,7 @@ LIGHT: dict[str, Any] = {
 
 @dataclasses.dataclass(frozen=True)
 class GeneratorRunConfig:
-    """What a generator's training is told; the defaults are what learns fastest on two cores."""
+    """Configuration of a generator's training; the defaults are what learns fastest on two cores."""
 
     preset: Literal["default", "paper"] = "default"
     """Where the other values come from: what learns fastest on two cores, or the paper's appendix."""

@@ -28,7 +28,7 @@ class BankGrid:
 
     The cells are spaced evenly in the image, not in the room: in bearing, and in the *inverse* of the distance, by
     which a goal on the floor grows and sinks as it comes near. Where the poses know how far ahead of its goal pose the
-    goal stands, turning the goal pose about the goal changes little but which side of it is seen, and one yaw is
+    goal stands, turning the goal pose about the goal only changes which side of it is seen, and one yaw is
     enough. If they do not (``goal_offsets=(0.0,)``), many yaws are better.
 
     Attributes:

@@ -11,7 +11,7 @@ POLAR = torch.tensor([[0.05, 0.5], [-0.4, 1.5], [2.0, 0.2]])
 
 
 def square(row: int, column: int) -> torch.Tensor:
-    """Returns the frames with the goal in the first two, in the second one as far as asked to the right."""
+    """Returns the frames with the goal in the first two, in the second one at a column."""
     frames = FRAMES.clone()
     frames[0, row : row + 8, 4:12] = 200
     frames[1, row : row + 8, column : column + 8] = 200

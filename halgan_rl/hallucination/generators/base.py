@@ -25,7 +25,7 @@ class HallucinationGenerator(nn.Module, ABC):
     Its output depends on the relative pose and a latent alone, never on the image.
 
     Args:
-        configuration: how the network is told the relative pose.
+        configuration: how the relative pose is described to the network.
         pose_size: P, entries of a pose.
         latent_size: Z.
 

@@ -22,7 +22,7 @@ class CoordinateGenerator(HallucinationGenerator):
     of the image's channels, then an opacity in [0, 1] for each frame.
 
     Args:
-        configuration: how the network is told the relative pose.
+        configuration: how the relative pose is described to the network.
         pose_size: P, entries of a pose.
         latent_size: Z; the latent is drawn from N(0, 1). It has little to say: which way the goal is turned.
 

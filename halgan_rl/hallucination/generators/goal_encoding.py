@@ -1,4 +1,4 @@
-"""How a relative pose is told to the networks: the paper's "configuration"."""
+"""How a relative pose is described to the networks: the paper's "configuration"."""
 
 from typing import Literal
 

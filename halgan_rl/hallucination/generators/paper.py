@@ -21,7 +21,7 @@ class PaperGenerator(HallucinationGenerator):
     upsampling, from 32x32.
 
     Args:
-        configuration: how the network is told the relative pose.
+        configuration: how the relative pose is described to the network.
         pose_size: P, entries of a pose.
         latent_size: Z.
         composition: ``"dimming"`` is the paper's tanh(s + H), which shrinks the contrast of the whole image even where

@@ -48,7 +48,7 @@ def _check_pixels(name: str, pixels: Tensor, image_shape: ImageShape) -> None:
 
 
 def matching_settings(near_goal: Frames, failed: Frames, poses: PlanarPoses) -> tuple[Tensor, Tensor]:
-    """Numbers the flags of near-goal poses and of failed ones, int64 ``[N]`` and ``[M]``: they tell the goals apart.
+    """Numbers the flags of near-goal poses and of failed ones, int64 ``[N]`` and ``[M]``, one number for each goal.
 
     Raises:
         ValueError: if there is a near-goal frame with flags that no failed frame has.
