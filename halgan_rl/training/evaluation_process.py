@@ -23,6 +23,10 @@ from halgan_rl.training.lifeline import Lifeline
 REMEDY = "or evaluate in this process (evaluate_at_once; recipes: --evaluation.no-background)"
 
 
+class ProcessEndedError(RuntimeError):
+    """The process that evaluates has ended, or was ended; says what is known of why."""
+
+
 class EvaluationProcess:
     """Evaluates policies in a process of its own, so that training need not wait.
 
@@ -40,8 +44,9 @@ class EvaluationProcess:
         settings: further arguments of :func:`~halgan_rl.training.evaluation.evaluate`.
 
     Raises:
-        RuntimeError: on entering the context, if the process could not be started; from an evaluation's ``result()``,
-            if the process has died or takes longer than ``timeout``.
+        ProcessEndedError: on entering the context, or from an evaluation's ``result()``, if the process has died or
+            takes longer than ``timeout``.
+        RuntimeError: on entering the context, if the environment could not be made.
     """
 
     def __init__(
@@ -72,12 +77,12 @@ class EvaluationProcess:
     def __enter__(self) -> "EvaluationProcess":
         try:
             self._started.result()
-        except BaseException as error:
+        except BaseException as error:  # Ctrl-C, too, while the process starts
             self._end()
-            if not isinstance(error, Exception):
+            if isinstance(error, ProcessEndedError) or not isinstance(error, Exception):
                 raise
             raise RuntimeError(
-                f"the process that evaluates could not be started: {error!r}; mend that, {REMEDY}"
+                f"the environment could not be made in the process that evaluates: {error!r}; mend that, {REMEDY}"
             ) from error
         return self
 
@@ -111,13 +116,13 @@ class EvaluationProcess:
                 self._connection.send(policy)
             if not self._connection.poll(self._timeout):
                 self._process.kill()
-                raise RuntimeError(
+                raise ProcessEndedError(
                     f"the process that evaluates took longer than {self._timeout:g} s and was ended: give it a longer "
                     f"timeout, evaluate fewer starts, {REMEDY}"
                 )
             answer = self._connection.recv()
         except (EOFError, OSError) as error:
-            raise RuntimeError(f"the process that evaluates {self._fate()}, {REMEDY}") from error
+            raise ProcessEndedError(f"the process that evaluates {self._fate()}, {REMEDY}") from error
         if isinstance(answer, BaseException):
             raise answer
         return answer

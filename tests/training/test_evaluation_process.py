@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 
 from halgan_rl.training.evaluation import evaluate
-from halgan_rl.training.evaluation_process import EvaluationProcess, evaluate_at_once
+from halgan_rl.training.evaluation_process import EvaluationProcess, ProcessEndedError, evaluate_at_once
 from tests.training.test_evaluation import Corridor
 
 SEEDS = [2, 1, 0]
@@ -31,19 +32,25 @@ def unmakeable() -> Corridor:
     raise OSError("no display")
 
 
-def test_policies_are_evaluated_in_order_as_they_were_when_handed_over() -> None:
+@pytest.fixture(scope="module")
+def process() -> Iterator[EvaluationProcess]:
+    """One process for all tests that leave it running."""
+    with EvaluationProcess(Corridor, seeds=SEEDS) as process:
+        yield process
+
+
+def test_policies_are_evaluated_in_order_as_they_were_when_handed_over(process: EvaluationProcess) -> None:
     fast, slow = (
         evaluate(Corridor(), make_policy(1.0), seeds=SEEDS),
         evaluate(Corridor(), make_policy(0.1), seeds=SEEDS),
     )
     assert fast != slow
-    with EvaluationProcess(Corridor, seeds=SEEDS) as process:
-        policy = make_policy(1.0)
-        first = process(policy)
-        with torch.no_grad():
-            policy.module.bias.fill_(0.1)
-        second = process(policy)
-        assert (first.result(timeout=60), second.result(timeout=60)) == (fast, slow)
+    policy = make_policy(1.0)
+    first = process(policy)
+    with torch.no_grad():
+        policy.module.bias.fill_(0.1)
+    second = process(policy)
+    assert (first.result(timeout=60), second.result(timeout=60)) == (fast, slow)
 
 
 def test_at_once_it_is_done_when_it_returns() -> None:
@@ -52,13 +59,8 @@ def test_at_once_it_is_done_when_it_returns() -> None:
     assert future.result() == evaluate(Corridor(), make_policy(1.0), seeds=SEEDS)
 
 
-def test_what_evaluation_raises_arrives() -> None:
-    with EvaluationProcess(Corridor, seeds=[]) as process, pytest.raises(ValueError, match="seeds is empty"):
-        process(make_policy(1.0)).result(timeout=60)
-
-
-def test_what_evaluation_raises_arrives_with_its_traceback() -> None:
-    with EvaluationProcess(Corridor, seeds=SEEDS) as process, pytest.raises(OSError, match="lost") as caught:
+def test_what_evaluation_raises_arrives_with_its_traceback(process: EvaluationProcess) -> None:
+    with pytest.raises(OSError, match="lost") as caught:
         process(Unplugged()).result(timeout=60)
     assert "in forward" in "".join(caught.value.__notes__)
 
@@ -68,8 +70,8 @@ class Unplugged(nn.Module):
         raise OSError("lost")
 
 
-def test_an_error_that_cannot_be_sent_arrives_as_text() -> None:
-    with EvaluationProcess(Corridor, seeds=SEEDS) as process, pytest.raises(RuntimeError, match="Unsendable: 1 and 2"):
+def test_an_error_that_cannot_be_sent_arrives_as_text(process: EvaluationProcess) -> None:
+    with pytest.raises(RuntimeError, match="Unsendable: 1 and 2"):
         process(Faulty()).result(timeout=60)
 
 
@@ -91,37 +93,32 @@ def test_a_process_that_cannot_start_is_reported_with_reason_and_remedy_before_t
 
 
 @pytest.mark.parametrize(
-    ("signal_number", "said"),
-    [(signal.SIGKILL, "SIGKILL.*out of memory"), (signal.SIGSEGV, "ended by SIGSEGV"), (None, "exit code 3")],
-    ids=str,
+    ("signal_number", "said"), [(signal.SIGKILL, "SIGKILL.*out of memory"), (signal.SIGSEGV, "ended by SIGSEGV")]
 )
-def test_a_process_that_dies_is_reported_with_what_ended_it(signal_number: signal.Signals | None, said: str) -> None:
+def test_a_process_that_is_killed_is_reported_with_the_signal(signal_number: int, said: str) -> None:
+    process = EvaluationProcess(Corridor, seeds=SEEDS)
+    os.kill(process.pid, signal_number)
+    with pytest.raises(ProcessEndedError, match=f"{said}.*--evaluation.no-background"):
+        process.__enter__()
+
+
+def test_a_process_that_ends_is_reported_with_its_exit_code_to_all_who_wait_for_it() -> None:
     with EvaluationProcess(Corridor, seeds=SEEDS) as process:
-        first, second = process(Suicide(signal_number)), process(make_policy(1.0))
-        with pytest.raises(RuntimeError, match=f"{said}.*--evaluation.no-background"):
-            first.result(timeout=60)
-        with pytest.raises(RuntimeError, match=said):
-            second.result(timeout=60)
+        for evaluation in (process(Exiting()), process(make_policy(1.0))):
+            with pytest.raises(ProcessEndedError, match=r"exit code 3.*--evaluation.no-background"):
+                evaluation.result(timeout=60)
 
 
-class Suicide(nn.Module):
-    """Stands for whatever ends a process."""
-
-    def __init__(self, signal_number: signal.Signals | None) -> None:
-        super().__init__()
-        self.signal_number = signal_number
-
+class Exiting(nn.Module):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self.signal_number is None:
-            os._exit(3)
-        os.kill(os.getpid(), self.signal_number)
+        os._exit(3)
         return tensordict
 
 
 def test_an_evaluation_that_takes_too_long_is_given_up_and_its_process_ended() -> None:
     with EvaluationProcess(Corridor, seeds=SEEDS) as process:
         process._timeout = 0.5
-        with pytest.raises(RuntimeError, match=r"longer than 0.5 s.*--evaluation.no-background"):
+        with pytest.raises(ProcessEndedError, match=r"longer than 0.5 s.*--evaluation.no-background"):
             process(Endless()).result(timeout=60)
         process._process.join(10)
         assert not is_alive(process.pid)
@@ -129,7 +126,7 @@ def test_an_evaluation_that_takes_too_long_is_given_up_and_its_process_ended() -
 
 def test_a_start_that_takes_too_long_is_given_up() -> None:
     process = EvaluationProcess(unhurried, seeds=SEEDS, timeout=0.5)
-    with pytest.raises(RuntimeError, match=r"longer than 0.5 s"):
+    with pytest.raises(ProcessEndedError, match=r"longer than 0.5 s"):
         process.__enter__()
     assert not is_alive(process.pid)
 
