@@ -17,14 +17,15 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import dispatch
+from tensordict.nn import TensorDictModule, TensorDictSequential, dispatch
 from torch import Tensor, nn
 from torch.nn import functional as F
 from torchrl.objectives import DQNLoss, LossModule
 from torchrl.objectives.utils import distance_loss
 
+from halgan_rl.agents.action_bounds import BoundedTanh
 from halgan_rl.agents.ddpg import Actor, Critic, UnsaturatedDDPGLoss
-from halgan_rl.agents.ddqn import QNetwork
+from halgan_rl.agents.ddqn import FirstBest, QNetwork
 from halgan_rl.agents.fast_cpu.block_encoder import encode_together, fits
 from halgan_rl.keys import next_key
 
@@ -183,23 +184,28 @@ def share_passes(loss: LossModule) -> bool:
     if not next(loss.parameters()).is_cpu:
         return False
     if type(loss) is UnsaturatedDDPGLoss:
-        networks, wanted, fast = (
-            [loss.actor_network[0].module, loss.value_network.module],
-            [Actor, Critic],
-            OnePassDDPGLoss,
-        )
-    elif type(loss) is DQNLoss and loss.delay_value and loss.action_space == "one_hot":
-        networks, wanted, fast = [loss.value_network[0].module], [QNetwork], OnePassDQNLoss
+        parts = [*_parts(loss.actor_network), *_parts(loss.value_network)]
+        wanted, fast = [Actor, BoundedTanh, Critic], OnePassDDPGLoss
+    elif type(loss) is DQNLoss and loss.delay_value:
+        parts, wanted, fast = _parts(loss.value_network), [QNetwork, FirstBest], OnePassDQNLoss
     else:
         return False
-    if [type(network) for network in networks] != wanted or not all(_is_usual(network) for network in networks):
+    if [type(part) for part in parts] != wanted or not all(_is_usual(part) for part in parts):
         return False
     loss.__class__ = fast
     _ = loss._cached_networks  # now: where the loss is compiled is no place to copy networks
     return True
 
 
-def _is_usual(network: Actor | Critic | QNetwork) -> bool:
-    """Whether the encoder fits, and all that learns in the head are linear layers: see :func:`_pass_through`."""
-    learning = [layer for layer in network.head if next(layer.parameters(), None) is not None]
-    return fits(network.encoder) and all(type(layer) is nn.Linear for layer in learning)
+def _parts(network: nn.Module) -> list[nn.Module]:
+    """Returns the modules of a network that reads and writes a TensorDict, one after another."""
+    modules = network.module if isinstance(network, TensorDictSequential) else [network]
+    return [part.module if isinstance(part, TensorDictModule) else part for part in modules]
+
+
+def _is_usual(part: nn.Module) -> bool:
+    """Whether an encoder fits, and all that learns behind it are linear layers: see :func:`_pass_through`."""
+    if not isinstance(part, Actor | Critic | QNetwork):
+        return True
+    learning = [layer for layer in part.head if next(layer.parameters(), None) is not None]
+    return fits(part.encoder) and all(type(layer) is nn.Linear for layer in learning)
