@@ -80,8 +80,8 @@ class PlanarPoses:
 
     def check(self, pose: Tensor, name: str) -> None:
         """Raises a ``ValueError`` that names ``name`` unless all of ``pose`` ``[..., P]`` are such poses."""
-        names = ", ".join(("x [m]", "y [m]", "yaw [rad]", *self.flags))
         if not pose.ndim or pose.shape[-1] != self.size or not pose.is_floating_point():
+            names = ", ".join(("x [m]", "y [m]", "yaw [rad]", *self.flags))
             raise ValueError(
                 f"{name} is {pose.dtype} {tuple(pose.shape)}; its last dimension must hold {self.size} floats: "
                 f"{names}. Name flags that follow in PlanarPoses(flags=(...)); for other poses give an object of your "
@@ -90,6 +90,8 @@ class PlanarPoses:
         if not torch.isfinite(pose).all():
             bad = pose.reshape(-1, self.size)[~torch.isfinite(pose).all(-1).flatten()][0]
             raise ValueError(f"{name} is not finite: {short(bad)}. Mend the pose observation.")
+        if not self.flags:
+            return
         flags = self.flag_part(pose)
         wrong = ((flags != 0) & (flags != 1)).any(-1)
         if wrong.any():

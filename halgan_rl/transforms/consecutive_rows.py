@@ -23,12 +23,8 @@ def dense(rows: TensorDictBase) -> TensorDictBase:
 
     A part of a lazy stack shares its rows with the whole: setting an entry on the one would set it on the other.
     """
-    return rows.contiguous() if _is_lazy(rows) else rows
-
-
-def _is_lazy(rows: TensorDictBase) -> bool:
-    nested = (value for value in rows.values() if isinstance(value, TensorDictBase))
-    return isinstance(rows, LazyStackedTensorDict) or any(map(_is_lazy, nested))
+    lazy = any(isinstance(part, LazyStackedTensorDict) for part in (rows, *rows.values()))
+    return rows.contiguous() if lazy else rows
 
 
 def check_layout(layout: Layout, waiting: list[UnfinishedEpisode]) -> None:

@@ -19,6 +19,7 @@ from halgan_rl.transforms.consecutive_rows import (
     dense,
     layout_of,
 )
+from halgan_rl.transforms.held_rows import HeldRows
 from halgan_rl.transforms.n_step_rows import STEPS_KEY, future_rewards, n_step_rows
 from halgan_rl.transforms.unfinished_episode import Steps, UnfinishedEpisode, concatenate, future_poses
 
@@ -118,9 +119,7 @@ class StampFuturePoses(ReplayTransform):
         self.n_steps = n_steps
         self.discount = 1.0 if discount is None else discount
         self.poses = poses
-        self._waiting: list[UnfinishedEpisode] = []  # one an environment
-        self._before: list[UnfinishedEpisode] | None = None  # those before the last write, which may be refused
-        self._flushed: Tensor | None = None  # horizons of the rows released last by flush()
+        self._held = HeldRows()
         self._goalless: int | None = 0  # rows stamped while none had a usable goal; None once one had, or after warning
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -131,7 +130,7 @@ class StampFuturePoses(ReplayTransform):
     def _inv_call(self, tensordict: TensorDictBase | None) -> TensorDictBase | None:
         """Takes new rows ``[T]`` or ``[E, T]``; returns those whose future is now known, flat, or None."""
         if tensordict is None or 0 in tensordict.batch_size:
-            self._before = None
+            self._held.passed(None)
             return None
         if self._is_stamped(tensordict):
             return self._pass(tensordict)
@@ -139,7 +138,7 @@ class StampFuturePoses(ReplayTransform):
         rows = self._by_environment(tensordict)
         check_unpadded(rows)
         steps, layout = self._read_steps(rows), layout_of(rows)
-        waiting = [each.copy() for each in self._waiting] or [UnfinishedEpisode() for _ in range(len(rows))]
+        waiting = self._held.copy(len(rows))
         check_layout(layout, waiting)
         check_continuity(steps, waiting)
         ready: list[TensorDictBase] = []
@@ -148,7 +147,7 @@ class StampFuturePoses(ReplayTransform):
             ready += self._release(each, each.count_known(self.max_distance))
             each.own_last_chunk()
         released = concatenate(ready)
-        self._before, self._waiting, self._flushed = self._waiting, waiting, None
+        self._held.write(waiting)
         return released
 
     def flush(self) -> TensorDictBase | None:
@@ -161,10 +160,9 @@ class StampFuturePoses(ReplayTransform):
         Returns:
             Rows ``[N]``, or None if none were held back.
         """
-        waiting = [each.copy() for each in self._waiting]
+        waiting = self._held.copy(environments=0)
         released = concatenate([chunk for each in waiting for chunk in self._release(each, each.count)])
-        self._before, self._waiting = self._waiting, []
-        self._flushed = None if released is None else released.get(self.keys.hindsight_horizon)
+        self._held.write([], flushed=None if released is None else released.get(self.keys.hindsight_horizon))
         return released
 
     def undo_write(self) -> None:
@@ -173,20 +171,19 @@ class StampFuturePoses(ReplayTransform):
         A storage that refuses the rows of a write calls this, as ``FrameStorage`` does, so that nothing is lost. A
         second call changes nothing.
         """
-        if self._before is not None:
-            self._waiting, self._before, self._flushed = self._before, None, None
+        self._held.undo()
 
     def drop_held_rows(self) -> None:
         """Forgets the rows held back, as ``replay_buffer.empty()`` does on a ``FrameStorage``.
 
         Other storages do not know of this transform: call it when you empty their buffer in mid-episode.
         """
-        self._waiting, self._before, self._flushed = [], None, None
+        self._held.drop()
 
     def get_extra_state(self) -> dict[str, Any]:
         """Returns the rows held back, as plain dictionaries of tensors, one an environment, and how they are read."""
         states: list[dict[str, Any] | None] = []
-        for waiting in self._waiting:
+        for waiting in self._held.waiting:
             rows = concatenate(list(waiting.chunks))
             states.append(None if rows is None else {"count": len(rows), "rows": rows.to_dict()})
         return {"max_distance": self.max_distance, "n_steps": self.n_steps, "waiting": states}
@@ -209,7 +206,7 @@ class StampFuturePoses(ReplayTransform):
             if saved is not None:
                 rows = TensorDict.from_dict(saved["rows"], batch_size=[saved["count"]])
                 each.append(rows, self._read_steps(rows), layout_of(rows))
-        self._waiting, self._before, self._flushed = waiting, None, None
+        self._held.drop(waiting)
 
     def _is_stamped(self, tensordict: TensorDictBase) -> bool:
         keys = (self.keys.hindsight_pose, self.keys.hindsight_horizon)  # their get() knows lazy stacks, keys() does not
@@ -223,14 +220,13 @@ class StampFuturePoses(ReplayTransform):
                 f"These rows hold {distance} future poses each ({dotted(self.keys.hindsight_pose)}), this transform "
                 f"stamps max_distance={self.max_distance}: write rows of one max_distance."
             )
-        if self._flushed is None or tensordict.get(self.keys.hindsight_horizon) is not self._flushed:
-            self._before = None
+        self._held.passed(tensordict.get(self.keys.hindsight_horizon))
         return tensordict
 
     def _refuse_other_n_step_returns(self, tensordict: TensorDictBase) -> None:
         """Refuses rows that span several steps already, or will after this transform."""
         spanning = tensordict.get(STEPS_KEY, None) is not None
-        if spanning or (not self._waiting and _any_multi_step(self)):
+        if spanning or (not self._held.waiting and _any_multi_step(self)):
             raise ValueError(
                 "A MultiStepTransform (or MultiStep) changes these rows, so that hindsight cannot know at which of "
                 "their steps a goal is reached. Remove it: StampFuturePoses(max_distance, n_steps=n, discount=g) makes "
@@ -245,10 +241,10 @@ class StampFuturePoses(ReplayTransform):
                 "write them with replay_buffer.extend(row.unsqueeze(0))."
             )
         rows = dense(tensordict).reshape(-1, tensordict.batch_size[-1])
-        if self._waiting and len(rows) != len(self._waiting):
+        if self._held.waiting and len(rows) != len(self._held.waiting):
             raise ValueError(
                 f"These rows come from {len(rows)} environments (batch size {tuple(tensordict.batch_size)}), those "
-                f"held back from {len(self._waiting)}. Write those first: replay_buffer.extend(transform.flush())."
+                f"held back from {len(self._held.waiting)}. Write those first: replay_buffer.extend(transform.flush())."
             )
         return rows
 
