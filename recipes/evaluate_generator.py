@@ -124,7 +124,8 @@ def main(config: Config) -> None:
         "truth": paint_each(renderer, chosen),
         "hallucinated": paint_each(painter, chosen),
     }
-    pictures.draw_frame_grid(config.out / "fidelity.png", rows, title=f"{domain.name}: random walks, held out")
+    title = f"{domain.name}: random walks, held out"
+    pictures.draw_frame_grid(config.out / "fidelity.png", rows, title=title, frame_stack=domain.frame_stack)
     print_table(report)
     print(f"look at {config.out / 'fidelity.png'}")
 

@@ -21,7 +21,7 @@ from halgan_rl.hallucination.hallucinators import GeneratorHallucinator
 from halgan_rl.hallucination.judging import fidelity
 from halgan_rl.hallucination.judging.painting import paint_each
 from halgan_rl.hallucination.training.adversarial import AdversarialConfig
-from halgan_rl.hallucination.training.data import Frames
+from halgan_rl.hallucination.training.data import Frames, check_images
 from halgan_rl.hallucination.training.matte_regression import MatteConfig
 from halgan_rl.hallucination.training.steps import LOSSES, train_generator
 from halgan_rl.hallucination.weights import save_weights
@@ -107,6 +107,9 @@ def run(
         FileExistsError: if the folder of the run already holds anything.
         ValueError: if the frames do not fit the domain.
     """
+    if held_out is not None:
+        for name in ("pixels", "truth"):
+            check_images(f"held_out[{name!r}]", held_out[name], domain.image_shape)
     folder = RunFolder(config.out, columns=COLUMNS)
     folder.write_config(dataclasses.asdict(config))
     torch.manual_seed(config.seed)  # initial weights
@@ -159,7 +162,8 @@ def compare_with_truth(
     }
     chosen = torch.linspace(0, len(held_out["pose"]) - 1, min(16, len(held_out["pose"]))).long()
     title = f"{domain.name}, seed {config.seed}: held-out poses"
-    pictures.draw_frame_grid(picture, {label: frames[chosen] for label, frames in rows.items()}, title=title)
+    few = {label: frames[chosen] for label, frames in rows.items()}
+    pictures.draw_frame_grid(picture, few, title=title, frame_stack=domain.frame_stack)
     found = fidelity.compare(*rows.values(), frame_stack=domain.frame_stack)
     return {f"truth/{name}": value for name, value in dataclasses.asdict(found).items()}
 

@@ -138,6 +138,19 @@ def test_frames_of_any_shape_without_a_simulator_make_a_generator(tmp_path: Path
     assert load_generator(path, fingerprint={}, poses=domain.poses, image_shape=shape).image_shape == shape
 
 
+def test_stacked_grey_frames_are_compared_with_the_truth_and_drawn(tmp_path: Path) -> None:
+    shape: dict[str, Any] = {"image_shape": (48, 32, 2), "frame_stack": 2}
+    domain = Domain("mine", make=None, action_spec=None, **shape)  # type: ignore[arg-type]
+    config = GeneratorRunConfig(environment="mine", out=tmp_path / "run", mattes=MatteConfig(steps=1, batch_size=4))
+    near_goal = synthetic.near_goal(16, **shape)
+    held_out = near_goal | {"pixels": near_goal["empty"], "truth": near_goal["pixels"]}
+    data = {"near_goal": near_goal, "failed": synthetic.failed(16, **shape)}
+    assert generator_run.run(config, domain, **data, held_out=held_out)["truth/mask_overlap"] >= 0
+    assert (tmp_path / "run" / "hallucinations.png").exists()
+    with pytest.raises(ValueError, match=r"held_out\['truth'\] is torch.float32"):
+        generator_run.run(config, domain, **data, held_out=held_out | {"truth": held_out["truth"] / 255})
+
+
 def test_a_folder_that_holds_a_run_is_refused_first(tmp_path: Path) -> None:
     (tmp_path / "metrics.csv").write_text("precious")
     with pytest.raises(FileExistsError, match="already holds a run"):

@@ -25,7 +25,7 @@ def check_data(generator: HallucinationGenerator, near_goal: Frames, failed: Fra
         for entry in entries:
             if entry not in frames:
                 raise KeyError(f"{name} lacks {entry!r}: it holds {sorted(frames)}.")
-        _check_pixels(f"{name}['pixels']", frames["pixels"], generator.image_shape)
+        check_images(f"{name}['pixels']", frames["pixels"], generator.image_shape)
         for entry in entries[1:]:
             poses.check(frames[entry], f"{name}[{entry!r}]")
             if frames[entry].shape[:-1] != frames["pixels"].shape[:1]:
@@ -35,8 +35,12 @@ def check_data(generator: HallucinationGenerator, near_goal: Frames, failed: Fra
                 )
 
 
-def _check_pixels(name: str, pixels: Tensor, image_shape: ImageShape) -> None:
-    """Refuses images that are not those which the generator paints."""
+def check_images(name: str, pixels: Tensor, image_shape: ImageShape) -> None:
+    """Refuses images that are not those which a generator paints.
+
+    Raises:
+        ValueError: unless they are uint8 ``[N, *image_shape]``, N at least 1; names both shapes.
+    """
     if pixels.dtype == torch.uint8 and tuple(pixels.shape[1:]) == image_shape and len(pixels):
         return
     height, width, channels = image_shape
