@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import torch
 from torchrl.data import TensorSpec
 
-from halgan_rl.agents import ddpg, ddqn
+from halgan_rl.agents import ddpg, ddqn, sac
 from halgan_rl.agents.agent import Agent, AgentConfig, Algorithm
 from halgan_rl.agents.encoder import ImageShape
 from halgan_rl.keys import Keys
@@ -13,6 +13,7 @@ from halgan_rl.keys import Keys
 AGENTS: Mapping[str, Algorithm] = {
     "ddpg": ddpg.ALGORITHM,
     "ddqn": ddqn.ALGORITHM,
+    "sac": sac.ALGORITHM,
 }
 """Names of algorithms, and what is known of each."""
 
