@@ -25,14 +25,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import halgan_envs
 import torch
 import tyro
-from halgan_envs.adapters.torchrl_env import ComposerEnv
 from torchrl.data import TensorDictReplayBuffer
 
+import halgan_envs
 from benchmarks.rounds import take_turns, warm_heap
 from benchmarks.tables import Table, report
+from halgan_envs.adapters.torchrl_env import ComposerEnv
 from halgan_rl.agents.agent import Agent
 from halgan_rl.experiment.config import RunConfig
 from halgan_rl.experiment.methods import make_hindsight

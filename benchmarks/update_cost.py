@@ -4,12 +4,12 @@ Usage::
 
     python -m benchmarks.update_cost   # the recipe's batch
 
-Times updates of the recipe (sample, loss, backward, both optimizer steps, target update), sampled sixteen at once as in
-a training (:func:`halgan_rl.training.loop.draw_batches`), with no hindsight, with goals that are drawn and rewarded but not
-painted, with HALGAN looked up in the bank, with its generator itself and with the simulator as oracle, at the fraction of
-rows for which the recipe draws a goal at the start and at its mean over a run. All of them are painted; about half show
-nothing of their goal and are not relabelled in the end. Medians of processor time in alternating rounds; quote the
-ratios, machines are noisy.
+Times updates of the recipe (sample, loss, backward, both optimizer steps, target update), sampled sixteen at once as
+in a training (:func:`halgan_rl.training.loop.draw_batches`): with no hindsight, with goals that are drawn and
+rewarded but not painted, with HALGAN looked up in the bank, with its generator itself, and with the simulator as
+oracle. A goal is drawn for the fraction of rows at the start of the recipe, and for its mean over a run. All of these
+rows are painted; about half show nothing of their goal and are not relabelled in the end. Medians of processor time in
+alternating rounds; quote the ratios, machines are noisy.
 """
 
 import dataclasses
@@ -18,12 +18,12 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import halgan_envs
 import torch
 import tyro
 from tensordict import TensorDict
 from torch import Tensor
 
+import halgan_envs
 from benchmarks.rounds import ratio, seconds_a_call, take_turns, warm_heap
 from benchmarks.tables import Table, report
 from halgan_rl.experiment.config import RunConfig
@@ -101,8 +101,8 @@ def main(benchmark: Benchmark) -> None:
     measures = {name: partial(seconds_a_call, run, 1) for name, run in updates.items()}
     seconds = take_turns(measures, benchmark.rounds)
     title = (
-        f"Hallucination in a DDPG update, batch {default.training.batch_size}, one thread, medians of {benchmark.rounds} "
-        f"alternating rounds of {benchmark.updates}, processor time; ratios are medians of those of each round."
+        f"Hallucination in a DDPG update, batch {default.training.batch_size}, one thread, medians of "
+        f"{benchmark.rounds} alternating rounds of {benchmark.updates}, processor time; ratios are medians of those of each round."
     )
     lines = [
         [

@@ -52,7 +52,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import halgan_envs
-
 from halgan_rl.agents.ddpg import PAPER, DDPGConfig
 from halgan_rl.experiment.config import PAPER_PAINTER, PAPER_TRAINING, RunConfig
 from halgan_rl.experiment.methods import make_hindsight

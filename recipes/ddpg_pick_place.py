@@ -7,9 +7,9 @@ Usage::
     python recipes/ddpg_pick_place.py --method none      # plain DDPG: never sees a reward
     python recipes/ddpg_pick_place.py --preset paper     # the paper's appendix
 
-There is one reward, for the delivery. The pose has a fourth entry, ``held``. While it is 0, hindsight paints the red box,
-and being where the robot was later, or where it picked the box up, counts as success. While it is 1, the same holds for
-the green box.
+There is one reward, for the delivery. The pose has a fourth entry, ``held``. While it is 0, hindsight paints the red
+box, and being where the robot was later, or where it picked the box up, counts as success. While it is 1, the same
+holds for the green box.
 
 Every run writes a folder: ``config.json``, ``metrics.csv``, ``policy.safetensors`` with its manifest, ``curve.png``,
 ``agent.gif`` and ``hallucinations.png``. ``recipes/play.py`` plays the saved policy. Metrics, one row an evaluation:
@@ -43,13 +43,13 @@ Differences from the paper (Sahni et al., NeurIPS 2019, appendix), all undone by
 11. The generator is this library's (``recipes/train_generator.py``). Its output is tabulated once and looked up. Both
     images of a row show one latent's goal; the paper's preset draws a latent for each image.
 12. The actor's last layer starts near zero, as in DDPG's own paper.
-13. A moving average of the actor's weights, over some 500 updates, is evaluated and saved."""
+13. A moving average of the actor's weights, over some 500 updates, is evaluated and saved.
+"""
 
 from dataclasses import replace
 from pathlib import Path
 
 import halgan_envs
-
 from halgan_rl.agents.ddpg import PAPER, DDPGConfig
 from halgan_rl.experiment.config import PAPER_PAINTER, PAPER_TRAINING, RunConfig
 from halgan_rl.experiment.methods import make_hindsight

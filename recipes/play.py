@@ -10,10 +10,10 @@ import dataclasses
 from functools import partial
 from pathlib import Path
 
-import halgan_envs
 import torch
 import tyro
 
+import halgan_envs
 from halgan_rl.experiment import pictures
 from halgan_rl.experiment.policy import load_policy
 from halgan_rl.training.evaluation import evaluate, record
@@ -49,7 +49,8 @@ def main(config: Config) -> None:
     )
     if config.gif is not None:
         overview = domain.overview and partial(domain.overview, env, 256, 320)
-        pictures.write_gif(config.gif, record(env, policy, overview, seeds=seeds[:5], keys=domain.keys))
+        film = record(env, policy, overview, seeds=seeds[:5], keys=domain.keys, frame_stack=domain.frame_stack)
+        pictures.write_gif(config.gif, film)
         print(f"film: {config.gif}")
     env.close()
 

@@ -7,11 +7,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import halgan_envs
 import pytest
 import torch
 from safetensors.torch import load_file
 
+import halgan_envs
 import tests.recipes
 from halgan_rl.experiment.methods import make_hindsight
 from halgan_rl.experiment.presets import changed, parse_config
