@@ -102,7 +102,8 @@ def main(benchmark: Benchmark) -> None:
     seconds = take_turns(measures, benchmark.rounds)
     title = (
         f"Hallucination in a DDPG update, batch {default.training.batch_size}, one thread, medians of "
-        f"{benchmark.rounds} alternating rounds of {benchmark.updates}, processor time; ratios are medians of those of each round."
+        f"{benchmark.rounds} alternating rounds of {benchmark.updates}, processor time; ratios are medians of those of "
+        "each round."
     )
     lines = [
         [

@@ -140,14 +140,18 @@ class PlanarPoses:
 
     def goal_position(self, pose: Tensor, goal_pose: Tensor) -> Tensor:
         """Returns where the goal stands that is pursued at ``pose`` and reached at ``goal_pose``, ``[..., 2]`` [m]."""
-        offset = self.goal_offset(pose)
-        x, y, yaw = goal_pose[..., :3].unbind(-1)
-        return torch.stack([x + offset * yaw.cos(), y + offset * yaw.sin()], -1)
+        return torch.stack(self._goal_xy(pose, goal_pose), -1)
 
     def goal_polar(self, pose: Tensor, goal_pose: Tensor) -> Tensor:
         """Returns bearing [rad, positive is left] and distance [m] of the goal as seen from ``pose``, ``[..., 2]``."""
-        x, y = (self.goal_position(pose, goal_pose) - pose[..., :2]).unbind(-1)
+        goal_x, goal_y = self._goal_xy(pose, goal_pose)
+        x, y = goal_x - pose[..., 0], goal_y - pose[..., 1]
         return torch.stack([wrap_angle(torch.atan2(y, x) - pose[..., 2]), torch.hypot(x, y)], -1)
+
+    def _goal_xy(self, pose: Tensor, goal_pose: Tensor) -> tuple[Tensor, Tensor]:
+        offset = self.goal_offset(pose)
+        x, y, yaw = goal_pose[..., :3].unbind(-1)
+        return x + offset * yaw.cos(), y + offset * yaw.sin()
 
 
 def relative_pose(pose: Tensor, goal_pose: Tensor) -> Tensor:
