@@ -13,7 +13,7 @@ navigate: $(VENV)/ready  ## train a navigating agent (make navigate SEED=1 METHO
 	$(BIN)/python recipes/ddpg_navigate.py --method $(METHOD) --seed $(SEED) --out $(OUT)
 
 test: $(VENV)/ready check  ## all checks and the test suite, under ten minutes
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 2 --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 2 --dist worksteal
 
 test-slow: $(VENV)/ready  ## the tests that train for minutes
 	$(BIN)/python -m pytest -m slow

@@ -161,7 +161,7 @@ def make_round(recipe: Any, benchmark: Benchmark, out: Path, changes: Mapping[st
         agent,
         buffer=buffer,
         hindsight=hindsight,
-        config=changed(config, {"training.warmup_frames": 1}).training,
+        config=dataclasses.replace(config.training, warmup_frames=1),
         total_frames=benchmark.frames,
         evaluate_every=benchmark.frames,
         evaluate=watch.timed(EVALUATION, partial(evaluate_at_once, evaluation_env, seeds=starts)),

@@ -44,8 +44,9 @@ class SACConfig(AgentConfig):
     """Adam's learning rate for the actor."""
     critic_learning_rate: float = 1e-3
     """Adam's learning rate for the two critics."""
-    alpha: float = 0.01
-    """Entropy coefficient, at first: what a nat of entropy at one step is worth in reward."""
+    alpha: float = 0.001
+    """Entropy coefficient, at first: what a nat of entropy at one step is worth in reward. With 0.01 a run had 8 %
+    success after 6,000 frames of Navigate, with 0.001 another had 27 %."""
     learn_alpha: bool = True
     """Learn the entropy coefficient, so that the policy's entropy comes to ``target_entropy``."""
     alpha_learning_rate: float = 3e-4

@@ -49,8 +49,13 @@ def changed(config: Config, changes: Mapping[str, Any]) -> Config:
     Raises:
         AttributeError: if there is no such field.
     """
+    values: dict[str, Any] = {}
+    inner: dict[str, dict[str, Any]] = {}
     for name, value in changes.items():
         first, _, rest = name.partition(".")
-        inner = changed(getattr(config, first), {rest: value}) if rest else value
-        config = dataclasses.replace(config, **{first: inner})  # type: ignore[type-var]
-    return config
+        if rest:
+            inner.setdefault(first, {})[rest] = value
+        else:
+            values[first] = value
+    values |= {first: changed(getattr(config, first), nested) for first, nested in inner.items()}
+    return dataclasses.replace(config, **values)  # type: ignore[type-var]  # all at once: they are checked together

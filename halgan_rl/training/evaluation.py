@@ -141,6 +141,7 @@ def record(
     frames: list[np.ndarray] = []
 
     def film(state: TensorDictBase) -> None:
+        """Takes a picture of where the episode is."""
         seen = _last_frame(state[keys.pixels], frame_stack, keys)
         outside = [] if overview is None else [overview()]
         height = outside[0].shape[0] if outside else HEIGHT_ALONE

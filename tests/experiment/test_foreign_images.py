@@ -39,7 +39,7 @@ def test_images_of_any_shape_go_through_generator_buffer_pipeline_and_update(
     assert overlap_of_last_frame(generator, image_shape, frame_stack) > 0.4
 
     # Train an agent with it.
-    tiny = {**TINY, "painter.weights": tmp_path / "generator.safetensors", "painter.bank": True}
+    tiny = {**TINY, "painter.weights": tmp_path / "generator.safetensors", "painter.bank": False}
     run_config = changed(RunConfig(out=tmp_path / "run"), tiny)
     agent = make_agent(run_config, domain)
     before = [parameter.clone() for parameter in agent.network.parameters()]

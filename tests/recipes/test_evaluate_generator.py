@@ -13,7 +13,7 @@ from recipes.evaluate_generator import Config, main
 TINY = Config(frames=100, probe_frames=150, probe_steps=60)
 
 
-@pytest.mark.parametrize("bank", [False, True])
+@pytest.mark.parametrize("bank", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_shipped_weights_are_near_the_truth(bank: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main(dataclasses.replace(TINY, bank=bank, out=tmp_path / "report"))
     report = json.loads((tmp_path / "report" / "fidelity.json").read_text())

@@ -3,6 +3,7 @@
 Run by ``python -m tests.training.mortal_training MOMENT``.
 """
 
+import signal
 import sys
 import time
 
@@ -64,4 +65,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs start with it ignored
     main()

@@ -43,11 +43,13 @@ def mask_overlaps(
     distance, degrees = polar[:, 1], polar[:, 0].rad2deg().abs()
 
     def judge(rows: Tensor) -> dict[str, float]:
+        """Returns the overlap in some of the frames."""
         rows = rows & seen
         overlap = fidelity.compare(frames[rows], truth[rows], painted[rows]).mask_overlap if rows.any() else torch.nan
         return {"overlap": overlap, "frames": int(rows.sum())}
 
     def judge_bands(values: Tensor, bounds: Sequence[float], unit: str) -> dict[str, dict[str, float]]:
+        """Returns the overlap for each band of some values."""
         return {f"{low:g}-{high:g} {unit}": judge((values >= low) & (values < high)) for low, high in pairwise(bounds)}
 
     return {
