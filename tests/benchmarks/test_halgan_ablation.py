@@ -21,6 +21,7 @@ def test_variants_differ_from_each_other_and_leave_the_paper_alone() -> None:
     assert changed == {"minutes", "evaluate_every", "out"}
 
 
+@pytest.mark.slow
 def test_the_table_has_a_line_for_each_variant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tiny = {"near_goal_frames": 40, "failed_frames": 40, "held_out_frames": 4, "evaluate_every": 1}
     shipped = "shipped: matte regression alone"

@@ -12,6 +12,7 @@ from recipes import ddpg_navigate
 from tests.recipes import TINY
 
 
+@pytest.mark.slow
 def test_a_training_is_timed() -> None:
     assert milliseconds_a_frame(ddpg_navigate, Benchmark(frames=160), TINY) > 0
 

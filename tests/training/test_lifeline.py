@@ -12,7 +12,8 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PATIENCE = 10.0
 """How long all processes may take to end [s]."""
-MOMENTS = ("starting", "collecting", "updating", "shutting down", "without cleaning up")
+OTHER_MOMENTS = ("starting", "collecting", "shutting down", "without cleaning up")
+"""Moments that the quick suite leaves out."""
 
 
 def press_control_c_twice(parent: int) -> None:
@@ -33,7 +34,12 @@ def kill(parent: int) -> None:
 
 @pytest.mark.parametrize(
     ("moment", "end"),
-    [*((moment, press_control_c_twice) for moment in MOMENTS), ("updating", terminate), ("collecting", kill)],
+    [
+        ("updating", press_control_c_twice),
+        ("updating", terminate),
+        ("collecting", kill),
+        *(pytest.param(moment, press_control_c_twice, marks=pytest.mark.slow) for moment in OTHER_MOMENTS),
+    ],
     ids=lambda value: value if isinstance(value, str) else value.__name__,
 )
 def test_no_process_outlives_a_training_by_more_than_seconds(moment: str, end: object) -> None:
