@@ -7,7 +7,7 @@ Usage::
 Runs the loop of ``halgan_rl.training.loop`` on the parts that ``halgan_rl.experiment.run`` makes for a recipe's default
 configuration, past the warm-up, and times each part without those within it: rendering is not counted as physics.
 Collecting, all together, bounds what collecting at the same time as learning could save. The loop's own part is the
-moving average of the weights, and the figures; files and pictures are left out. One thread, medians of processor time
+moving average of the weights, and the metrics; files and pictures are left out. One thread, medians of processor time
 in alternating rounds.
 
 Evaluation is done at once here, not beside training, and spread over the frames between two of them. The agent of a

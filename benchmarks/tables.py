@@ -14,7 +14,7 @@ RESULTS = Path(__file__).parent / "results"
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """A table of figures.
+    """A table of numbers.
 
     Attributes:
         title: What was measured, and how.

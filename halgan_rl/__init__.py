@@ -1,6 +1,6 @@
 """Visual hindsight experience replay for PyTorch: replay transforms, hallucinators, agents; knows no simulator.
 
-The names that most users import. The rest stands in the rooms below: ``transforms``, ``replay``, ``hallucination``,
+The names that most users import. The rest is in the rooms below: ``transforms``, ``replay``, ``hallucination``,
 ``agents``, ``training``, ``experiment``.
 """
 

@@ -6,7 +6,7 @@ Usage::
     python recipes/train_generator.py --preset paper                                    # the paper's appendix, days
 
 Two sets of images are collected first. *Near-goal* frames are the last states of successful rollouts of a scripted
-driver that knows where the goal is; it stands in for a person who shows the goal a few dozen times. *Failed* frames are
+driver that knows where the goal is; it plays a person who shows the goal a few dozen times. *Failed* frames are
 of uniformly random actions. No frame is paired with the same frame without the goal, and no image is picked by hand.
 
 Every run writes a folder: ``config.json``, ``metrics.csv``, ``generator.safetensors`` with its manifest, and

@@ -1,4 +1,4 @@
-"""An agent that learns, and what all agents are told."""
+"""An agent that learns, and the configuration that all agents share."""
 
 import copy
 from collections.abc import Callable, Mapping
@@ -23,7 +23,7 @@ NOT_IN_KEYS = ("steps_to_next_obs", "priority_weight")
 
 @dataclass(frozen=True)
 class AgentConfig:
-    """What every agent is told."""
+    """The configuration that all agents share."""
 
     discount: float = 0.95
     """Discount factor."""

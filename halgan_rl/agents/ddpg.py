@@ -28,7 +28,7 @@ METRICS = {"pred_value": "q_value", "loss_value": "loss_value", "loss_actor": "l
 
 @dataclass(frozen=True)
 class DDPGConfig(AgentConfig):
-    """What a DDPG agent is told."""
+    """Configuration of a DDPG agent."""
 
     actor_learning_rate: float = 1e-4
     """Adam's learning rate for the actor."""
@@ -224,7 +224,7 @@ def make_agent(
     """Returns actor and critic, both on the camera image alone, how the actor explores, and how they learn.
 
     Args:
-        config: What the agent is told.
+        config: The configuration.
         action_spec: Actions ``[A]`` with finite bounds, which the policy and its exploration keep.
         image_shape: Height, width and channels.
         keys: Where rows keep what.

@@ -24,7 +24,7 @@ METRICS = {"loss": "loss"}
 
 @dataclass(frozen=True)
 class DDQNConfig(AgentConfig):
-    """What a DDQN agent is told."""
+    """Configuration of a DDQN agent."""
 
     learning_rate: float = 1e-3
     """Adam's learning rate."""
@@ -113,7 +113,7 @@ def make_agent(
     """Returns a network of action values on the camera image alone, how it explores, and how it learns.
 
     Args:
-        config: What the agent is told.
+        config: The configuration.
         action_spec: One-hot actions ``[A]``.
         image_shape: Height, width and channels.
         keys: Where rows keep what.

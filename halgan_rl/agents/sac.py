@@ -38,7 +38,7 @@ SMALLEST_DEVIATION = 0.1
 
 @dataclass(frozen=True)
 class SACConfig(AgentConfig):
-    """What a SAC agent is told."""
+    """Configuration of a SAC agent."""
 
     actor_learning_rate: float = 3e-4
     """Adam's learning rate for the actor."""
@@ -141,7 +141,7 @@ def make_agent(
     """Returns an actor and two critics, all on the camera image alone, how the actor explores, and how they learn.
 
     Args:
-        config: What the agent is told.
+        config: The configuration.
         action_spec: Actions ``[A]`` with finite bounds, which the policy keeps.
         image_shape: Height, width and channels.
         keys: Where rows keep what.

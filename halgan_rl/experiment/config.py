@@ -1,4 +1,4 @@
-"""What a run is told: one configuration, made of small ones that each belong to a part."""
+"""The configuration of a run, made of small ones that each belong to a part."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -48,7 +48,7 @@ class EvaluationConfig:
 
 @dataclass(frozen=True)
 class RunConfig:
-    """What a run is told."""
+    """Configuration of a run."""
 
     preset: str = "default"
     """Where the other values come from: what learns fastest on two cores, or the paper's appendix."""
