@@ -4,10 +4,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+import torch
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
-from halgan_rl.keys import Keys
+from halgan_rl.keys import Keys, dotted
 from halgan_rl.poses import PlanarPoses
 from halgan_rl.transforms import Hallucinator
 
@@ -49,4 +50,30 @@ class Domain:
             raise ValueError(
                 f"image_shape={self.image_shape} must be height, width and channels, the channels a multiple of "
                 f"frame_stack={self.frame_stack}."
+            )
+
+    def check(self, env: EnvBase) -> None:
+        """Raises a ``ValueError`` unless an environment observes and acts as the domain says; names what differs."""
+        promised = {
+            "pixels": (self.keys.pixels, self.image_shape),
+            "pose": (self.keys.pose, (self.poses.size,)),
+            "action": (self.keys.action, tuple(self.action_spec.shape)),
+        }
+        specs = {**dict(env.observation_spec.items(True, True)), **dict(env.full_action_spec.items(True, True))}
+        for name, (key, shape) in promised.items():
+            if key not in specs:
+                found = ", ".join(sorted(map(dotted, specs)))
+                raise ValueError(
+                    f"the environment of the domain {self.name!r} has no {dotted(key)}, set by keys=Keys({name}="
+                    f"{getattr(self.keys, name)!r}); it has {found}."
+                )
+            if tuple(specs[key].shape) != shape:
+                raise ValueError(
+                    f"{dotted(key)} of the environment is {tuple(specs[key].shape)}, the domain {self.name!r} says "
+                    f"{shape}: correct the domain. Images are height, width, channels."
+                )
+        if specs[self.keys.pixels].dtype != torch.uint8:
+            raise ValueError(
+                f"{dotted(self.keys.pixels)} of the environment is {specs[self.keys.pixels].dtype}, but images must be "
+                "uint8, as they are rendered."
             )

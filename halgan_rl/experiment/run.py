@@ -115,10 +115,11 @@ class Run:
         self._stack = ExitStack()
 
     def __enter__(self) -> "Run":
+        env = make_env(self.config, self.domain)
         with ExitStack() as stack:  # undone if anything below fails
             self._evaluate = stack.enter_context(make_evaluator(self.config, self.domain))
             self.folder = self._make_folder()
-            self._collector = make_collector(self.config, self.domain, self.agent.explorer)
+            self._collector = make_collector(self.config, self.domain, self.agent.explorer, env=env)
             stack.callback(self._collector.shutdown)
             self._stack = stack.pop_all()
         return self
@@ -218,6 +219,19 @@ def paint_stored_rows(
     return {"failed": rows[keys.pixels], **painted}
 
 
+def make_env(config: RunConfig, domain: Domain) -> EnvBase | None:
+    """Returns the environment to train in, which is what the domain says; None if a process of its own makes it.
+
+    Raises:
+        ValueError: if the environment is not what the domain says.
+    """
+    if config.training.background_collection:
+        return None
+    env = domain.make(seed=config.seed)
+    domain.check(env)
+    return env
+
+
 def make_collector(
     config: RunConfig, domain: Domain, explorer: TensorDictModuleBase, *, env: EnvBase | None = None
 ) -> BaseCollector:
@@ -231,8 +245,13 @@ def make_collector(
         "init_random_frames": config.training.warmup_frames,
     }
     if not config.training.background_collection:
-        env = env or domain.make(seed=config.seed)
-        return Collector(env, explorer, track_traj_ids=False, auto_register_policy_transforms=False, **settings)
+        return Collector(
+            env or make_env(config, domain),
+            explorer,
+            track_traj_ids=False,
+            auto_register_policy_transforms=False,
+            **settings,
+        )
     collector = BackgroundCollector(
         domain.make, explorer, postproc=ExcludeTransform("collector"), num_threads=config.threads, **settings
     )
