@@ -1,4 +1,4 @@
-# Everything here works on a fresh machine with Python >= 3.11, git, make and an EGL driver.
+# Everything here works on a fresh machine with Python 3.11 or 3.12, git, make and an EGL driver.
 PYTHON ?= python3
 VENV ?= .venv
 BENCH_VENV ?= .venv-bench
