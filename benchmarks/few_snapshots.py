@@ -61,10 +61,11 @@ def judge(size: int, study: Study) -> list[str]:
     """Returns the table's line for one size of R."""
     with TemporaryDirectory() as temporary:
         generator, judged, agent = (Path(temporary, name) for name in ("generator", "judged", "agent"))
-        train_generator.main(train_generator.Config(near_goal_frames=size, seed=study.seed, out=generator))
+        changes = {"data.near_goal_frames": size, "seed": study.seed, "out": generator}
+        train_generator.main(changed(train_generator.PRESETS["default"], changes))
         weights = generator / "generator.safetensors"
         evaluate_generator.main(evaluate_generator.Config(weights=weights, out=judged))
-        changes = {
+        changes = {  # of the agent
             "painter.weights": weights,
             "total_frames": study.total_frames,
             "seed": study.seed,

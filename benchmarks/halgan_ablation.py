@@ -21,35 +21,35 @@ import tyro
 from matplotlib.figure import Figure
 
 from benchmarks.tables import Table, report
+from halgan_rl.experiment.generator_run import GeneratorRunConfig
 from halgan_rl.experiment.presets import changed
 from halgan_rl.experiment.run_folder import read_metrics
 from recipes import train_generator
 
-ADVERSARIAL: dict[str, Any] = {"mattes.steps": 0, "adversarial.steps": 1_000_000, "evaluate_every": 50}
-"""Adversarial training from scratch, with all ideas: what the variants below take one idea from."""
-PAPERS_GENERATOR: dict[str, Any] = {"generator.kind": "paper"}
+Changes = dict[str, Any]
+MANY = 1_000_000
+"""Steps of a training that ends with its minutes."""
 
-PAPER = "paper's loop"
-VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
-    "shipped: matte regression alone": ("default", {}),
-    "shipped, not mirrored": ("default", {"mirror": False}),
-    "shipped, distance and bearing for a configuration": ("default", {"generator.configuration": "polar"}),
-    "matte regression, then adversarial": ("default", {"adversarial.steps": 1_000_000}),
-    "adversarial with all ideas": ("default", ADVERSARIAL),
-    "adversarial, no moving average": ("default", ADVERSARIAL | {"adversarial.average_decay": 0.0}),
-    "adversarial, penalty at every step": ("default", ADVERSARIAL | {"adversarial.penalty_interval": 1}),
-    "adversarial, 5 critic steps": ("default", ADVERSARIAL | {"adversarial.critic_steps": 5, "evaluate_every": 20}),
-    "adversarial, not mirrored": ("default", ADVERSARIAL | {"mirror": False}),
-    "adversarial, distance and bearing for a configuration": (
-        "default",
-        ADVERSARIAL | {"generator.configuration": "polar", "generator.standardise": False},
-    ),
-    "adversarial, wide kernel density": ("default", ADVERSARIAL | {"adversarial.bandwidth": 1.0}),
-    "adversarial, paper's generator, identity where H = 0": ("default", ADVERSARIAL | PAPERS_GENERATOR),
-    "adversarial, paper's generator, tanh(s + H)": (
-        "default",
-        ADVERSARIAL | PAPERS_GENERATOR | {"generator.composition": "dimming"},
-    ),
+
+def adversarial(**changes: Any) -> tuple[str, Changes]:
+    """Return the default's adversarial training with some values changed."""
+    return "default", {f"training.adversarial.{name}": value for name, value in changes.items()}
+
+
+PAPER, REGRESSION = "the paper's loop", "matte regression"
+VARIANTS: dict[str, tuple[str, Changes]] = {
+    "adversarial": ("default", {}),
+    "... backgrounds not matched": adversarial(backgrounds=0),
+    "... no wrong poses": adversarial(wrong_pose_weight=0.0),
+    "... no painted maps": adversarial(painted_maps=False),
+    "... no penalty": adversarial(penalty_weight=0.0, fine_penalty_weight=0.0),
+    "... whole images from the start": adversarial(coarse=0.0),
+    "... no moving average": adversarial(average_decay=0.0),
+    "... not mirrored": ("default", {"training.mirror": False}),
+    "... distance and bearing": ("default", {"generator.configuration": "polar"}),
+    "... the paper's generator": ("default", {"generator.kind": "paper"}),
+    REGRESSION: ("regression", {}),
+    "matte regression, then adversarial": ("default", {"training.mattes.steps": 2_500}),
     PAPER: ("paper", {"evaluate_every": 5}),
 }
 """Name: preset of ``train_generator``, and what is changed of it, by the names of its flags."""
@@ -96,7 +96,7 @@ def train(name: str, ablation: Ablation, kept: Path) -> None:
         shutil.copy(config.out / "metrics.csv", kept)
 
 
-def make_config(name: str, ablation: Ablation, out: Path) -> train_generator.Config:
+def make_config(name: str, ablation: Ablation, out: Path) -> GeneratorRunConfig:
     """Returns the configuration of a variant."""
     preset, changes = VARIANTS[name]
     minutes = ablation.paper_minutes if name == PAPER else ablation.minutes

@@ -17,10 +17,11 @@ from .adapters.gymnasium_env import GymnasiumEnv, gymnasium_id, register_named
 from .adapters.torchrl_env import ComposerEnv, make
 from .domains import domain
 from .environment import Environment
+from .frames import failed_frames, near_goal_frames, with_truth, without_goal
 from .near_goal import collect_failed, collect_near_goal
 from .oracle import GoalRenderer
 from .suite.names import NAMES, named
-from .suite.navigate import navigate_2m, navigate_4m
+from .suite.navigate import camouflage_2m, navigate_2m, navigate_4m
 from .suite.pebble import find_pebble
 from .suite.pick_and_place import pick_and_place_2m
 
@@ -30,17 +31,22 @@ __all__ = [
     "Environment",
     "GoalRenderer",
     "GymnasiumEnv",
+    "camouflage_2m",
     "collect_failed",
     "collect_near_goal",
     "domain",
+    "failed_frames",
     "find_pebble",
     "gymnasium_id",
     "make",
     "named",
     "navigate_2m",
     "navigate_4m",
+    "near_goal_frames",
     "pick_and_place_2m",
     "rendering",
+    "with_truth",
+    "without_goal",
 ]
 
 register_named()

@@ -138,20 +138,24 @@ def collect_failed(environment: Environment, count: int, random_state: np.random
         random_state: Source of the actions; the starts are the environment's own.
 
     Returns:
-        ``pixels`` uint8 [M, H, W, 3] and ``pose`` float32 [M, P].
+        ``pixels`` uint8 [M, H, W, 3], ``pose`` float32 [M, P], and ``episode`` int64 [M], the number of the walk that a
+        snapshot is of; those of a walk are consecutive.
 
     Raises:
         ValueError: if count is out of range.
     """
     _check_count(count)
     stages = environment.task.stages
-    snapshots: list[tuple[np.ndarray, np.ndarray]] = []
+    snapshots: list[tuple[np.ndarray, np.ndarray, int]] = []
+    walks = 0
     for number, stage in enumerate(stages, start=1):
         enough = count * number // len(stages)
         while len(snapshots) < enough:
-            episode, succeeded = _wander(environment, stage, random_state)
-            snapshots += [] if succeeded else episode[: enough - len(snapshots)]
-    return dict(zip(("pixels", "pose"), map(np.stack, zip(*snapshots, strict=True)), strict=True))
+            walk, succeeded = _wander(environment, stage, random_state)
+            if not succeeded:
+                snapshots += [(*snapshot, walks) for snapshot in walk[: enough - len(snapshots)]]
+                walks += 1
+    return dict(zip(("pixels", "pose", "episode"), map(np.stack, zip(*snapshots, strict=True)), strict=True))
 
 
 def _drive(environment: Environment, driver: NoisyDriver, keep: int) -> tuple[list[Any], bool]:

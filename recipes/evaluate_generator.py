@@ -24,10 +24,8 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import tyro
-from torch import Tensor
 
 import halgan_envs
 from halgan_rl.experiment import pictures
@@ -35,23 +33,12 @@ from halgan_rl.experiment.domain import Domain
 from halgan_rl.experiment.run_folder import check_unused, versions, write_json
 from halgan_rl.hallucination.bank import HallucinationBank
 from halgan_rl.hallucination.hallucinators import GeneratorHallucinator
-from halgan_rl.hallucination.judging.mask_overlaps import mask_overlaps
-from halgan_rl.hallucination.judging.painting import paint_each, paint_one_goal
-from halgan_rl.hallucination.judging.pose_probe import probe_errors, train_probe
-from halgan_rl.hallucination.judging.scatter import cut_stretches, scatter
+from halgan_rl.hallucination.judging.painting import paint_each
+from halgan_rl.hallucination.judging.pose_probe import train_probe
+from halgan_rl.hallucination.judging.report import View, as_text, judge
 from halgan_rl.hallucination.judging.walks import draw_goals
-from halgan_rl.hallucination.training.data import Frames
 from halgan_rl.hallucination.weights import load_generator, read_manifest, shipped_weights
 from halgan_rl.transforms import Hallucinator
-
-IN_VIEW = 0.36
-"""Bearing within which the whole goal is in view [rad]: the camera sees 0.43 to either side."""
-WITHIN = 1.5
-"""Distance within which goals are large enough for the probe [m]."""
-DISTANCES = (0.0, 0.3, 0.6, 1.0, 1.5, 6.0)
-"""Bounds of the bands of distance [m]."""
-BEARINGS = (0.0, 8.0, 16.0, 24.5)
-"""Bounds of the bands of bearing, to either side [degrees]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,122 +69,47 @@ def main(config: Config) -> None:
     """Collects, paints, compares, and writes the report."""
     check_unused(config.out)
     domain = halgan_envs.domain(config.environment)
+    path = config.weights or shipped_weights(domain.name)
     torch.manual_seed(config.seed)
     rng = torch.Generator().manual_seed(config.seed)
-    path = config.weights or shipped_weights(domain.name)
     painter = make_painter(config, domain, path, rng)
     renderer: Any = domain.goal_renderer()
+    view = View(domain.poses)
 
-    # The judge, which sees real frames only; then what is judged: failed frames with goals in hindsight.
-    real = in_view(domain, near_goal(config, config.probe_frames, config.seed))
-    probe = train_probe(real["pixels"], polar(domain, real), rng=rng, steps=config.probe_steps)
-    failed = draw_failures(config, domain, renderer, rng)
+    # The judge, which sees real frames only.
+    real = view.select(halgan_envs.near_goal_frames(domain.name, config.probe_frames, seed=config.seed))
+    probe = train_probe(real["pixels"], view.polar(real), rng=rng, steps=config.probe_steps)
 
-    # The same poses: real, truly rendered, and hallucinated.
-    real = in_view(domain, near_goal(config, config.frames, config.seed + 1))
-    empty = without_goal(real, renderer)
-    images = {"real": real["pixels"], "truth": paint_each(renderer, empty), "hallucinated": paint_each(painter, empty)}
-    report: dict[str, Any] = {"probe": probe_errors(probe, polar(domain, real), images)}
-    images = {"truth": paint_each(renderer, failed), "hallucinated": paint_each(painter, failed)}
-    report |= mask_overlaps(
-        failed["pixels"], *images.values(), polar(domain, failed), distances=DISTANCES, bearings=BEARINGS
+    # What is judged: goals in failed frames some steps ahead, at the poses of real frames, and along real rollouts.
+    failed = halgan_envs.failed_frames(domain.name, 10 * config.frames, seed=config.seed + 3)
+    pose, goal_pose = draw_goals(failed["pose"], failed["episode"], config.frames, rng=rng)
+    walks = halgan_envs.without_goal({"pose": pose, "goal_pose": goal_pose}, renderer)
+    near_goal, rollouts = (
+        halgan_envs.near_goal_frames(domain.name, config.frames, seed=config.seed + number) for number in (1, 2)
     )
-
-    # Stretches of trajectories with one goal.
-    real = near_goal(config, config.frames, config.seed + 2)
-    stretches = cut_stretches(real, whole_goal_in_view(polar(domain, real)))
-    empty_ones = [without_goal(stretch, renderer) for stretch in stretches]
-    report["consistency"] = {
-        "real": scatter(probe, [(stretch["pose"], stretch["pixels"]) for stretch in stretches])
-    } | {
-        label: scatter(probe, [(stretch["pose"], paint_one_goal(by, stretch)) for stretch in empty_ones])
-        for label, by in (("truth", renderer), ("hallucinated", painter))
-    }
+    for frames in (near_goal, rollouts):
+        frames["empty"] = halgan_envs.without_goal(frames, renderer)["pixels"]
+    data = {"near_goal": view.select(near_goal), "rollouts": rollouts, "walks": walks}
+    report = judge(painter, renderer, probe=probe, view=view, **data)
 
     # The report, and a picture of failed frames with the goal in view.
     config.out.mkdir(parents=True, exist_ok=True)
     about = {"config": dataclasses.asdict(config), "weights": read_manifest(path), "versions": versions()}
     write_json(config.out / "fidelity.json", report | about)
-    chosen = {name: entry[:16] for name, entry in in_view(domain, failed).items()}
-    rows = {
-        "failed": chosen["pixels"],
-        "truth": paint_each(renderer, chosen),
-        "hallucinated": paint_each(painter, chosen),
-    }
+    few = {name: entry[:16] for name, entry in view.select(walks).items()}
+    rows = {"failed": few["pixels"], "truth": paint_each(renderer, few), "hallucinated": paint_each(painter, few)}
     title = f"{domain.name}: random walks, held out"
     pictures.draw_frame_grid(config.out / "fidelity.png", rows, title=title, frame_stack=domain.frame_stack)
-    print_table(report)
-    print(f"look at {config.out / 'fidelity.png'}")
+    print(f"{as_text(report)}\nlook at {config.out / 'fidelity.png'}")
 
 
 def make_painter(config: Config, domain: Domain, path: Path, rng: torch.Generator) -> Hallucinator:
     """Returns who is judged: the generator, or the bank of its output."""
-    generator = load_generator(
-        path,
-        fingerprint=domain.fingerprint,
-        poses=domain.poses,
-        image_shape=domain.image_shape,
-        frame_stack=domain.frame_stack,
-    )
+    shapes: dict[str, Any] = {"image_shape": domain.image_shape, "frame_stack": domain.frame_stack}
+    generator = load_generator(path, fingerprint=domain.fingerprint, poses=domain.poses, **shapes)
     if config.bank:
         return HallucinationBank(generator, poses=domain.poses, rng=rng, share_latent=config.share_latent)
     return GeneratorHallucinator(generator, rng=rng, share_latent=config.share_latent)
-
-
-def near_goal(config: Config, count: int, seed: int) -> Frames:
-    """Collects near-goal frames of successful rollouts."""
-    environment = halgan_envs.named(config.environment)(random_state=seed)
-    data = halgan_envs.collect_near_goal(environment, count, np.random.RandomState(seed))
-    environment.close()
-    return {name: torch.from_numpy(array) for name, array in data.items()}
-
-
-def draw_failures(config: Config, domain: Domain, renderer: Any, rng: torch.Generator) -> Frames:
-    """Walks at random; returns poses, goals some steps ahead, and the frames from there without any goal."""
-    environment = halgan_envs.named(config.environment)(random_state=config.seed + 3)
-    source = np.random.RandomState(config.seed + 3)
-    pose = torch.from_numpy(halgan_envs.collect_failed(environment, 10 * config.frames, source)["pose"])
-    step = environment.task.robot.max_speed * environment.task.control_timestep
-    environment.close()
-    poses = draw_goals(pose, config.frames, max_step=max(0.1, 1.1 * step), rng=rng)
-    return without_goal(dict(zip(("pose", "goal_pose"), poses, strict=True)), renderer)
-
-
-def without_goal(data: Frames, renderer: Any) -> Frames:
-    """Returns the data with the frames that are seen in a room without a goal."""
-    frames = np.stack([renderer.render_without_goal(pose) for pose in data["pose"].double().numpy()])
-    return data | {"pixels": torch.from_numpy(frames)}
-
-
-def polar(domain: Domain, data: Frames) -> Tensor:
-    """Returns bearing [rad] and distance [m] of the goals, ``[N, 2]``."""
-    return domain.poses.goal_polar(data["pose"], data["goal_pose"])
-
-
-def whole_goal_in_view(where: Tensor) -> Tensor:
-    """Returns which goals at bearing and distance ``[N, 2]`` are wholly in view and near."""
-    return (where[:, 0].abs() < IN_VIEW) & (where[:, 1] < WITHIN)
-
-
-def in_view(domain: Domain, data: Frames) -> Frames:
-    """Returns the rows in which the whole goal is in view and near."""
-    rows = whole_goal_in_view(polar(domain, data))
-    return {name: entry[rows] for name, entry in data.items()}
-
-
-def print_table(report: dict[str, Any]) -> None:
-    """Prints what the report holds."""
-    probe, no_op, scatter = report["probe"], report["no_op"], report["consistency"]
-    print(f"{'pose probe':24s} {'bearing':>10s} {'distance':>10s}   ({probe['frames']} frames)")
-    for label in ("real", "truth", "hallucinated"):
-        print(f"  {label:22s} {probe[label]['bearing_degrees']:8.2f} ° {probe[label]['distance_metres']:8.3f} m")
-    print(f"  {'hallucinated / real':22s} {probe['ratio']['bearing']:8.2f}   {probe['ratio']['distance']:8.2f}")
-    print("mask overlap")
-    for label, band in {**report["mask"], **report["mask_by_distance"], **report["mask_by_bearing"]}.items():
-        print(f"  {label:22s} {band['overlap']:8.2f}   ({band['frames']} frames)")
-    print(f"change outside the mask  {no_op['outside_the_mask']:8.2f} / 255")
-    print(f"change out of view       {no_op['out_of_view']:8.2f} / 255   ({no_op['frames_out_of_view']} frames)")
-    print("goal scatters in the room by", ", ".join(f"{value:.3f} m ({label})" for label, value in scatter.items()))
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """WalledRoom: a square room with a wall of another colour in each direction."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -7,13 +8,28 @@ import numpy as np
 from ..contact import CONTACT
 from .arena import WALL_GROUP, Arena
 
-_WALLS = (
-    # name, direction of the outward normal, two colours: none bright, as the goals are.
-    ("east", 0.0, (0.36, 0.48, 0.60), (0.44, 0.56, 0.68)),
-    ("north", 0.5 * np.pi, (0.42, 0.55, 0.42), (0.50, 0.64, 0.50)),
-    ("west", np.pi, (0.66, 0.60, 0.42), (0.74, 0.68, 0.50)),
-    ("south", 1.5 * np.pi, (0.52, 0.47, 0.60), (0.60, 0.55, 0.68)),
-)
+
+@dataclass(frozen=True)
+class Wall:
+    """How a wall looks, and where.
+
+    Attributes:
+        angle: Direction of the outward normal [rad].
+        dark: One colour of its checkers.
+        light: The other.
+    """
+
+    angle: float
+    dark: tuple[float, ...]
+    light: tuple[float, ...]
+
+
+WALLS = {  # None is bright, as the goals are.
+    "east": Wall(0.0, (0.36, 0.48, 0.60), (0.44, 0.56, 0.68)),
+    "north": Wall(0.5 * np.pi, (0.42, 0.55, 0.42), (0.50, 0.64, 0.50)),
+    "west": Wall(np.pi, (0.66, 0.60, 0.42), (0.74, 0.68, 0.50)),
+    "south": Wall(1.5 * np.pi, (0.52, 0.47, 0.60), (0.60, 0.55, 0.68)),
+}
 _THICKNESS = 0.05
 
 
@@ -38,8 +54,8 @@ class WalledRoom(Arena):
         self.description = f"room of {size} m"
         self._build_light()
         self._build_floor()
-        for wall in _WALLS:
-            self._build_wall(wall_height, *wall)
+        for wall_name, wall in WALLS.items():
+            self._build_wall(wall_name, wall, wall_height)
         self._build_overview()
 
     def _build_light(self) -> None:
@@ -63,15 +79,13 @@ class WalledRoom(Arena):
             "geom", name="floor", type="plane", size=[half, half, 0.1], material=material, contype=0, conaffinity=0
         )
 
-    def _build_wall(
-        self, height: float, name: str, angle: float, dark: tuple[float, ...], light: tuple[float, ...]
-    ) -> None:
-        material = self._material(name, dark, light, repeat=2.0)
-        outwards = np.array([np.cos(angle), np.sin(angle)])
+    def _build_wall(self, name: str, wall: Wall, height: float) -> None:
+        material = self._material(name, wall.dark, wall.light, repeat=2.0)
+        outwards = np.array([np.cos(wall.angle), np.sin(wall.angle)])
         centre = outwards * (self.size + _THICKNESS) / 2
         self._mjcf_root.worldbody.add(
             "geom", name=name, type="box", size=[_THICKNESS / 2, self.size / 2 + _THICKNESS, height / 2],
-            pos=[*centre, height / 2], euler=[0, 0, angle], material=material,
+            pos=[*centre, height / 2], euler=[0, 0, wall.angle], material=material,
             group=WALL_GROUP, **CONTACT,
         )  # fmt: skip
 

@@ -13,26 +13,40 @@ GREEN = (0.05, 0.62, 0.10, 1.0)
 
 
 class GoalBox(MocapProp):
-    """A coloured cube on the floor that cannot be pushed: a mocap body, moved through physics only.
+    """A cube on the floor that cannot be pushed: a mocap body, moved through physics only.
 
     Args:
         size: Edge length [m].
         rgba: Colour.
+        checker: Two colours (red, green, blue) of a checkered cube instead, each side two fields wide.
         name: Name of the entity.
 
     Raises:
         ValueError: if the size is not positive.
     """
 
-    def _build(self, size: float = 0.08, rgba: tuple[float, ...] = RED, name: str = "goal_box") -> None:
+    def _build(
+        self,
+        size: float = 0.08,
+        rgba: tuple[float, ...] = RED,
+        checker: tuple[tuple[float, ...], tuple[float, ...]] | None = None,
+        name: str = "goal_box",
+    ) -> None:
         if size <= 0:
             raise ValueError(f"size must be positive; got {size} m.")
         self.size = size
         self._mjcf_root = mjcf.RootElement(model=name)
+        look = {"rgba": rgba} if checker is None else {"material": self._checkered(*checker)}
         self._mjcf_root.worldbody.add(
-            "geom", name="cube", type="box", size=[size / 2] * 3, pos=[0, 0, size / 2], rgba=rgba,
+            "geom", name="cube", type="box", size=[size / 2] * 3, pos=[0, 0, size / 2], **look,
             **CONTACT,
         )  # fmt: skip
+
+    def _checkered(self, one: tuple[float, ...], other: tuple[float, ...]) -> Any:
+        texture = self._mjcf_root.asset.add(
+            "texture", name="checker", type="cube", builtin="checker", rgb1=one, rgb2=other, width=64, height=64
+        )
+        return self._mjcf_root.asset.add("material", name="checker", texture=texture, specular=0.0)
 
     @property
     def radius(self) -> float:

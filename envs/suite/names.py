@@ -3,11 +3,12 @@
 from collections.abc import Callable
 
 from ..environment import Environment
-from .navigate import navigate_2m, navigate_4m
+from .navigate import camouflage_2m, navigate_2m, navigate_4m
 from .pebble import find_pebble
 from .pick_and_place import pick_and_place_2m
 
 NAMES: dict[str, Callable[..., Environment]] = {
+    "camouflage-2m": camouflage_2m,
     "navigate-2m": navigate_2m,
     "navigate-4m": navigate_4m,
     "pebble": find_pebble,

@@ -1,12 +1,13 @@
 """A generator's training: a folder in which a generator is trained, compared with the truth, and shown."""
 
 import dataclasses
+import json
 import shlex
 import sys
 import time
-from functools import partial
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,62 +15,78 @@ from tqdm import tqdm
 
 from halgan_rl.experiment import pictures
 from halgan_rl.experiment.domain import Domain
-from halgan_rl.experiment.run_folder import RunFolder, versions
+from halgan_rl.experiment.run_folder import RunFolder, as_json, versions
+from halgan_rl.experiment.state_file import load_state, save_state
 from halgan_rl.hallucination.generators.base import HallucinationGenerator
 from halgan_rl.hallucination.generators.config import GeneratorConfig
 from halgan_rl.hallucination.hallucinators import GeneratorHallucinator
 from halgan_rl.hallucination.judging import fidelity
 from halgan_rl.hallucination.judging.painting import paint_each
-from halgan_rl.hallucination.training.adversarial import AdversarialConfig
 from halgan_rl.hallucination.training.data import Frames, check_images
-from halgan_rl.hallucination.training.matte_regression import MatteConfig
-from halgan_rl.hallucination.training.steps import LOSSES, train_generator
+from halgan_rl.hallucination.training.steps import LOSSES, GeneratorTraining, GeneratorTrainingConfig
 from halgan_rl.hallucination.weights import save_weights
 
 COLUMNS = ("steps", "seconds", "truth/mask_overlap", "truth/centroid_error", "truth/outside_change", *LOSSES)
+STATE = "state.safetensors"
 LATENT_SEED = 20_000
 """Seed of the latents with which held-out poses are painted."""
-LIGHT: dict[str, Any] = {
-    "steps": 0,
-    "batch_size": 32,
-    "critic_steps": 1,
-    "discriminator_learning_rate": 3e-4,
-    "penalty_interval": 4,
-    "bandwidth": 0.1,
-    "average_decay": 0.99,
-    "discriminator_steps_ahead": 300,
-}
-"""Adversarial training that two cores can afford; left out by default."""
+MAY_DIFFER = ("minutes", "resume", "out")
+"""Fields of a configuration that may differ where a run is resumed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DataConfig:
+    """How many frames a generator is trained on, and judged by.
+
+    Raises:
+        ValueError: if a count is out of range.
+    """
+
+    near_goal_frames: int = 2_000
+    """Size of R, the near-goal frames."""
+    steps_before_goal: int = 80
+    """Frames of R from each rollout, besides its last; what is farther from the goal must be guessed."""
+    failed_frames: int = 5_000
+    """Frames of failed episodes to paint goals into."""
+    held_out_frames: int = 128
+    """Frames that are compared with the truth."""
+
+    def __post_init__(self) -> None:
+        """Refuses values that would fail only later."""
+        counts = {"near_goal_frames": 1, "steps_before_goal": 0, "failed_frames": 1, "held_out_frames": 1}
+        for name, least in counts.items():
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}={getattr(self, name)} must be at least {least}")
 
 
 @dataclasses.dataclass(frozen=True)
 class GeneratorRunConfig:
-    """Configuration of a generator's training; the defaults are what learns fastest on two cores."""
+    """Configuration of a generator's training; the defaults are what learns fastest on two cores.
 
-    preset: Literal["default", "paper"] = "default"
-    """Where the other values come from: what learns fastest on two cores, or the paper's appendix."""
+    Raises:
+        ValueError: if a value is out of range, or the generator has no mattes to fit.
+    """
+
+    preset: str = "default"
+    """Where the other values come from: `default` is what learns fastest on two cores, `paper` its appendix."""
     environment: str = "navigate-2m"
     """Name of the environment."""
     seed: int = 0
     """Seed of everything random in the run."""
     minutes: float | None = None
-    """Stop training after this long, whatever is left to do; what is kept then depends on the machine's speed."""
+    """Stop after this long, whatever is left to do; what is kept then depends on the machine's speed."""
     evaluate_every: int = 250
-    """Steps between comparisons with the truth."""
+    """Steps between comparisons with the truth; weights and the state to resume from are written as often."""
     out: Path = Path("runs/train_generator")
     """Folder of the run; must not hold one yet."""
-    mirror: bool = True
-    """Mirror half of the frames left to right."""
-    latent_noise: float | None = None
-    """Fraction of noise in the latents of matte regression; None: what suits the environment."""
-    discriminator_stride: Literal[1, 2] = 2
-    """Stride of the discriminator's first convolution."""
+    resume: bool = False
+    """Go on with the run in `out`, which must have the same configuration."""
+    data: DataConfig = dataclasses.field(default_factory=DataConfig)
+    """How many frames."""
     generator: GeneratorConfig = dataclasses.field(default_factory=GeneratorConfig)
     """Which generator."""
-    mattes: MatteConfig = dataclasses.field(default_factory=MatteConfig)
-    """Matte regression, for a generator by coordinates."""
-    adversarial: AdversarialConfig = dataclasses.field(default_factory=partial(AdversarialConfig, **LIGHT))
-    """Adversarial training, after matte regression."""
+    training: GeneratorTrainingConfig = dataclasses.field(default_factory=GeneratorTrainingConfig)
+    """How it is trained."""
 
     def __post_init__(self) -> None:
         """Refuses values that would fail only later."""
@@ -77,12 +94,8 @@ class GeneratorRunConfig:
             raise ValueError(f"evaluate_every={self.evaluate_every} must be at least 1")
         if self.minutes is not None and not self.minutes > 0:
             raise ValueError(f"minutes={self.minutes} must be positive")
-        if self.latent_noise is not None and not 0 <= self.latent_noise <= 1:
-            raise ValueError(f"latent_noise={self.latent_noise} must be within [0, 1]: it is a fraction")
-        if self.mattes.steps and self.generator.kind == "paper":
-            raise ValueError("generator.kind='paper' has no mattes to fit: pass --mattes.steps 0")
-        if not self.mattes.steps + self.adversarial.steps:
-            raise ValueError("mattes.steps and adversarial.steps are both 0: there is nothing to train")
+        if self.training.mattes.steps and self.generator.kind == "paper":
+            raise ValueError("generator.kind='paper' has no mattes to fit: pass --training.mattes.steps 0")
 
 
 def run(
@@ -104,50 +117,90 @@ def run(
         The last metrics, by the names of ``COLUMNS``.
 
     Raises:
-        FileExistsError: if the folder of the run already holds anything.
-        ValueError: if the frames do not fit the domain.
+        FileExistsError: if the folder of the run already holds anything, unless it is resumed.
+        FileNotFoundError: if there is nothing to resume.
+        ValueError: if the frames do not fit the domain, or the run to resume has another configuration.
     """
     if held_out is not None:
         for name in ("pixels", "truth"):
             check_images(f"held_out[{name!r}]", held_out[name], domain.image_shape)
-    folder = RunFolder(config.out, columns=COLUMNS)
-    folder.write_config(dataclasses.asdict(config))
+    folder, state = open_folder(config)
     torch.manual_seed(config.seed)  # initial weights
     generator = config.generator.make(
         image_shape=domain.image_shape, frame_stack=domain.frame_stack, pose_size=domain.poses.size
     )
-    steps = train_generator(
+    training = GeneratorTraining(
         generator,
         near_goal=near_goal,
         failed=failed,
         rng=torch.Generator().manual_seed(config.seed),
-        mattes=config.mattes,
-        adversarial=config.adversarial,
+        config=config.training,
         poses=domain.poses,
         standardise=config.generator.standardise,
-        mirror=config.mirror,
-        latent_noise=0.7 if config.latent_noise is None else config.latent_noise,
-        discriminator_stride=config.discriminator_stride,
     )
-    started = time.perf_counter()
-    metrics = dict.fromkeys(COLUMNS, float("nan"))
-    progress = tqdm(total=config.mattes.steps + config.adversarial.steps, unit="step", dynamic_ncols=True)
-    for kept, losses in steps:
+    metrics = dict.fromkeys(COLUMNS, float("nan")) | {"seconds": 0.0}
+    if state is not None:
+        training.load_state_dict(state["training"])
+        metrics = state["metrics"]
+    for losses, seconds in steps(config, training, before=metrics["seconds"]):
         metrics |= losses
-        progress.update()
-        seconds = time.perf_counter() - started
-        over = progress.n == progress.total or (config.minutes is not None and seconds > 60 * config.minutes)
-        if over or progress.n % config.evaluate_every == 0:
-            metrics |= {"steps": progress.n, "seconds": seconds}
+        if seconds is not None:
+            metrics |= {"steps": training.steps, "seconds": seconds}
+            kept = training.average
             if held_out is not None:
                 metrics |= compare_with_truth(config, domain, kept, held_out, folder.file("hallucinations.png"))
             folder.write_metrics(metrics)
             save_weights(folder.file("generator.safetensors"), kept, make_manifest(config, domain, kept, metrics))
-            progress.set_postfix(overlap=f"{metrics['truth/mask_overlap']:.2f}", refresh=False)
-        if over:
-            break
-    progress.close()
+            save_state(folder.file(STATE), {"training": training.state_dict(), "metrics": metrics})
     return metrics
+
+
+def open_folder(config: GeneratorRunConfig) -> tuple[RunFolder, dict[str, Any] | None]:
+    """Makes the folder of a run; or opens the one to resume, and reads its state.
+
+    Metrics of steps after the state's are dropped: they are made again.
+    """
+    if not config.resume:
+        folder = RunFolder(config.out, columns=COLUMNS)
+        folder.write_config(dataclasses.asdict(config))
+        return folder, None
+    state = load_state(config.out / STATE)
+    written = json.loads((config.out / "config.json").read_text())["config"]
+    now = json.loads(as_json(dataclasses.asdict(config)))
+    different = [name for name in now if name not in MAY_DIFFER and written.get(name) != now[name]]
+    if different:
+        raise ValueError(
+            f"{config.out} cannot be resumed with other values of {', '.join(different)}: pass those of its config.json"
+        )
+    steps = state["training"]["steps"]
+    return RunFolder.reopen(config.out, columns=COLUMNS, keep=lambda row: float(row["steps"]) <= steps), state
+
+
+def steps(
+    config: GeneratorRunConfig, training: GeneratorTraining, *, before: float
+) -> Iterator[tuple[dict[str, float], float | None]]:
+    """Makes the steps that are left, as long as there is time.
+
+    Args:
+        config: of the run.
+        training: makes them.
+
+    Keyword Args:
+        before: seconds that the run took before it was resumed.
+
+    Yields:
+        The losses of each step, and, where it is to be evaluated, the seconds of the run so far.
+    """
+    started = time.perf_counter() - before
+    total = config.training.steps
+    with tqdm(total=total, initial=training.steps, unit="step", dynamic_ncols=True) as progress:
+        over = training.steps == total
+        while not over:
+            losses = training.step()
+            progress.update()
+            seconds = time.perf_counter() - started
+            over = training.steps == total or (config.minutes is not None and seconds > 60 * config.minutes)
+            yield losses, seconds if over or training.steps % config.evaluate_every == 0 else None
 
 
 def compare_with_truth(

@@ -116,10 +116,13 @@ class Run:
 
     def __enter__(self) -> "Run":
         env = make_env(self.config, self.domain)
-        with ExitStack() as stack:  # undone if anything below fails
+        with ExitStack() as stack, ExitStack() as own:  # undone if anything below fails
+            if env is not None:
+                own.callback(env.close)
             self._evaluate = stack.enter_context(make_evaluator(self.config, self.domain))
             self.folder = self._make_folder()
             self._collector = make_collector(self.config, self.domain, self.agent.explorer, env=env)
+            own.pop_all()  # the collector closes its environment
             stack.callback(self._collector.shutdown)
             self._stack = stack.pop_all()
         return self
@@ -228,7 +231,11 @@ def make_env(config: RunConfig, domain: Domain) -> EnvBase | None:
     if config.training.background_collection:
         return None
     env = domain.make(seed=config.seed)
-    domain.check(env)
+    try:
+        domain.check(env)
+    except ValueError:
+        env.close()
+        raise
     return env
 
 

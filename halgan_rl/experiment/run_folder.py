@@ -6,6 +6,7 @@ import os
 import re
 import shlex
 import sys
+from collections.abc import Callable
 from importlib.metadata import requires, version
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,33 @@ class RunFolder:
         self.columns = columns
         with self.file("metrics.csv").open("w", newline="") as file:
             csv.writer(file).writerow(columns)
+
+    @classmethod
+    def reopen(cls, path: Path, *, columns: tuple[str, ...], keep: Callable[[dict[str, str]], bool]) -> "RunFolder":
+        """Returns the folder of an earlier run, to go on in.
+
+        Args:
+            path: of the folder.
+            columns: of its ``metrics.csv``.
+            keep: which rows of it to keep.
+
+        Raises:
+            ValueError: if ``metrics.csv`` has other columns.
+        """
+        folder = cls.__new__(cls)
+        folder.path, folder.columns = path, columns
+        with folder.file("metrics.csv").open(newline="") as file:
+            reader = csv.DictReader(file)
+            rows = [row for row in reader if keep(row)]
+        if tuple(reader.fieldnames or ()) != columns:
+            raise ValueError(f"{folder.file('metrics.csv')} has other columns: it was written by another version")
+        temporary = folder.file("metrics.csv.partial")
+        with temporary.open("w", newline="") as file:
+            writer = csv.DictWriter(file, columns)
+            writer.writeheader()
+            writer.writerows(rows)
+        os.replace(temporary, folder.file("metrics.csv"))
+        return folder
 
     def file(self, name: str) -> Path:
         """Returns the path of a file in the folder."""
@@ -71,8 +99,13 @@ def versions() -> dict[str, str]:
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Writes a JSON file atomically: a reader never meets a partial one."""
     temporary = path.with_name(path.name + ".partial")
-    temporary.write_text(json.dumps(content, indent=2, default=str) + "\n")
+    temporary.write_text(as_json(content))
     os.replace(temporary, path)
+
+
+def as_json(content: dict[str, Any]) -> str:
+    """Returns the text of a JSON file; what JSON does not know, such as paths, becomes strings."""
+    return json.dumps(content, indent=2, default=str) + "\n"
 
 
 def read_metrics(path: Path) -> dict[str, list[float]]:

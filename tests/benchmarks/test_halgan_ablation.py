@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import halgan_ablation
-from benchmarks.halgan_ablation import PAPER, VARIANTS, Ablation, make_config
+from benchmarks.halgan_ablation import PAPER, REGRESSION, VARIANTS, Ablation, make_config
 from recipes import train_generator
 
 
@@ -23,13 +23,13 @@ def test_variants_differ_from_each_other_and_leave_the_paper_alone() -> None:
 
 @pytest.mark.slow
 def test_the_table_has_a_line_for_each_variant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    tiny = {"near_goal_frames": 40, "failed_frames": 40, "held_out_frames": 4, "evaluate_every": 1}
-    shipped = "shipped: matte regression alone"
-    monkeypatch.setattr(halgan_ablation, "VARIANTS", {shipped: ("default", tiny), PAPER: ("paper", tiny)})
-    ablation = Ablation(out=tmp_path / "table", minutes=1e-6, paper_minutes=1e-6, only=(shipped, PAPER))
+    tiny = {f"data.{name}": 40 for name in ("near_goal_frames", "failed_frames")}
+    tiny |= {"data.held_out_frames": 4, "evaluate_every": 1}
+    monkeypatch.setattr(halgan_ablation, "VARIANTS", {REGRESSION: ("regression", tiny), PAPER: ("paper", tiny)})
+    ablation = Ablation(out=tmp_path / "table", minutes=1e-6, paper_minutes=1e-6, only=(REGRESSION, PAPER))
     halgan_ablation.main(ablation)
     table = json.loads((tmp_path / "table" / "ablation.json").read_text())["tables"][0]
-    assert [row[0] for row in table["rows"]] == [shipped, PAPER]
+    assert [row[0] for row in table["rows"]] == [REGRESSION, PAPER]
     assert {path.suffix for path in (tmp_path / "table").iterdir()} == {".csv", ".json", ".png"}
     monkeypatch.setattr(halgan_ablation, "train", None)  # what is there already is not trained again
     halgan_ablation.main(ablation)

@@ -36,6 +36,7 @@ def test_every_named_environment_passes_gymnasium_s_check_without_a_warning(name
 
 def test_every_name_has_an_id_by_one_rule():
     assert IDS == {
+        "camouflage-2m": "halgan_rl/Camouflage2m-v0",
         "navigate-2m": "halgan_rl/Navigate2m-v0",
         "navigate-4m": "halgan_rl/Navigate4m-v0",
         "pebble": "halgan_rl/Pebble-v0",

@@ -9,6 +9,8 @@ from halgan_envs.arenas.walled_room import WalledRoom
 from halgan_envs.props.goal_box import GoalBox
 from halgan_envs.robots.rover import Rover
 from halgan_envs.tasks.navigate import Navigate
+from halgan_rl.hallucination.judging.fidelity import changed
+from halgan_rl.hallucination.training.matte_regression import colour_index, goal_colours
 
 
 def make_task(size=2.0, **arguments):
@@ -101,11 +103,26 @@ def test_the_rooms_have_the_paper_s_size_and_the_small_one():
         sizes[name] = (*2 * task.arena.half_extent, *(goal.tolerance for goal in task.goals.values()))
         environment.close()
     assert sizes == {
+        "camouflage-2m": (2.0, 2.0, 0.01),
         "navigate-4m": (4.0, 4.0, 0.01),
         "navigate-2m": (2.0, 2.0, 0.01),
         "pebble": (6.0, 3.0, 0.05),
         "pick-and-place-2m": (2.0, 2.0, 0.02, 0.02),
     }
+
+
+def test_a_camouflaged_box_has_colours_that_failed_frames_show_as_well():
+    """A mask of colours that only near-goal frames show, with which matte regression starts, misses most of it."""
+    found = {}
+    for name in ("camouflage-2m", "navigate-2m"):
+        near, failed = halgan_envs.near_goal_frames(name, 300, seed=0), halgan_envs.failed_frames(name, 600, seed=1)
+        few = {entry: value[::6] for entry, value in near.items()}
+        frames = halgan_envs.with_truth(few, halgan_envs.domain(name).goal_renderer())
+        box = changed(frames["pixels"], frames["truth"])
+        is_goal = goal_colours(near["pixels"], failed["pixels"])[colour_index(few["pixels"])]
+        found[name] = float((is_goal & box).sum() / box.sum())
+    assert found["camouflage-2m"] < 0.4
+    assert found["navigate-2m"] > 0.8
 
 
 def test_a_reset_never_recompiles(room_2m):

@@ -61,6 +61,7 @@ def test_failed_snapshots_come_from_unsuccessful_wandering(room_2m):
     # The first episode whole, and the beginning of the next.
     jumps = np.hypot(*np.diff(failed["pose"][:, :2], axis=0).T) > 0.06
     assert jumps.nonzero()[0].tolist() == [200]
+    assert np.array_equal(failed["episode"], np.arange(250) > 200)
 
 
 @pytest.mark.parametrize("collect", [collect_near_goal, collect_failed])

@@ -5,8 +5,10 @@ from pathlib import Path
 
 import pytest
 from torchrl.data import Bounded
+from torchrl.envs import EnvBase
 
 import halgan_envs
+from halgan_rl.experiment import run
 from halgan_rl.experiment.config import RunConfig
 from halgan_rl.experiment.domain import Domain
 from halgan_rl.experiment.methods import make_hindsight
@@ -61,3 +63,32 @@ def test_ours_describe_their_environments(name: str) -> None:
 def test_an_image_that_is_no_stack_of_frames_is_refused() -> None:
     with pytest.raises(ValueError, match="a multiple of frame_stack=4"):
         room_domain((64, 64, 3), frame_stack=4)
+
+
+@pytest.mark.parametrize("fault", ["evaluation", "domain"])
+def test_a_run_that_cannot_start_closes_its_environment(
+    fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether its evaluation fails to start, or the environment is not what the domain says."""
+    closed = []
+    domain = room_domain()
+
+    def make(seed: int | None) -> EnvBase:
+        env = room_domain().make(seed=seed)
+        monkeypatch.setattr(env, "close", lambda **_: closed.append(env))
+        return env
+
+    def fail(*_: object) -> None:
+        raise OSError("no process left")
+
+    config = changed(RunConfig(method="none", out=tmp_path / "run"), TINY)
+    hindsight = make_hindsight(config, domain)
+    buffer, agent = make_buffer(config.training, hindsight, seed=0), make_agent(config, domain)
+    domain = dataclasses.replace(domain, make=make)
+    if fault == "evaluation":
+        monkeypatch.setattr(run, "make_evaluator", fail)
+    else:
+        domain = dataclasses.replace(domain, image_shape=(84, 84, 3))
+    with pytest.raises((OSError, ValueError)), Run(config, domain, agent, buffer, hindsight):
+        pass
+    assert len(closed) == 1

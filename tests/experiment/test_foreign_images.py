@@ -12,7 +12,7 @@ from halgan_rl.experiment.run import Run, make_agent, make_buffer
 from halgan_rl.hallucination.generators.coordinates import CoordinateGenerator
 from halgan_rl.hallucination.hallucinators import GeneratorHallucinator
 from halgan_rl.hallucination.judging.fidelity import changed as changed_pixels
-from halgan_rl.hallucination.training.matte_regression import MatteConfig, fit_mattes
+from halgan_rl.hallucination.training.matte_regression import MatteConfig, MatteRegression
 from halgan_rl.hallucination.weights import save_weights
 from tests.recipes import TINY
 from tests.room import POSES, draw, failed, near_goal, room_domain
@@ -33,7 +33,9 @@ def test_images_of_any_shape_go_through_generator_buffer_pipeline_and_update(
     generator.encoding.standardise(generator.encoding.labels(data["pose"], data["goal_pose"]))
     rng = torch.Generator().manual_seed(0)
     config = MatteConfig(steps=250, batch_size=32, pixels=256)
-    losses = list(fit_mattes(generator, near_goal=data, failed=failed(domain), rng=rng, config=config, poses=POSES))
+    data = {"near_goal": data, "failed": failed(domain)}
+    regression = MatteRegression(generator, **data, rng=rng, config=config, poses=POSES)
+    losses = [float(regression.step()["loss"]) for _ in range(config.steps)]
     assert losses[-1] < 0.5 * losses[0]
     save_weights(tmp_path / "generator.safetensors", generator, {"kind": "coordinates", **vars_of(generator)})
     assert overlap_of_last_frame(generator, image_shape, frame_stack) > 0.4

@@ -7,7 +7,7 @@ from torch import nn
 from halgan_rl.hallucination.generators.base import HallucinationGenerator
 from halgan_rl.hallucination.generators.coordinates import CoordinateGenerator
 from halgan_rl.hallucination.generators.paper import PaperGenerator
-from halgan_rl.hallucination.training.discriminator import Discriminator
+from halgan_rl.hallucination.training.paper_discriminator import Discriminator
 from tests.synthetic import SHAPES
 
 GENERATORS = [PaperGenerator, CoordinateGenerator]

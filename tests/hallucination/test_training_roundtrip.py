@@ -8,11 +8,11 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from halgan_rl.hallucination.bank import BankGrid, HallucinationBank
-from halgan_rl.hallucination.generators.base import HallucinationGenerator
 from halgan_rl.hallucination.generators.coordinates import CoordinateGenerator
 from halgan_rl.hallucination.training.adversarial import AdversarialConfig
 from halgan_rl.hallucination.training.matte_regression import MatteConfig
-from halgan_rl.hallucination.training.steps import LOSSES, train_generator
+from halgan_rl.hallucination.training.paper import PaperTrainingConfig
+from halgan_rl.hallucination.training.steps import LOSSES, GeneratorTraining, GeneratorTrainingConfig
 from halgan_rl.hallucination.weights import load_generator, save_weights
 from halgan_rl.poses import PlanarPoses
 from halgan_rl.transforms import Annealing, pipelines
@@ -28,20 +28,26 @@ def test_a_generator_of_any_shape_is_trained_saved_tabulated_and_paints_rows_of_
     torch.manual_seed(0)
     generator = CoordinateGenerator(image_shape=image_shape, frame_stack=frame_stack)
     data = synthetic.near_goal(32, image_shape=image_shape, frame_stack=frame_stack)
-    steps = train_generator(
+    training = GeneratorTraining(
         generator,
         near_goal=data,
         failed=synthetic.failed(32, image_shape=image_shape, frame_stack=frame_stack),
         rng=torch.Generator().manual_seed(0),
-        mattes=MatteConfig(steps=60, batch_size=32, pixels=128),
-        adversarial=AdversarialConfig(steps=1, batch_size=2, critic_steps=1, generator_learning_rate=1e-6),
-        discriminator_stride=2,
+        config=GeneratorTrainingConfig(
+            MatteConfig(steps=60, batch_size=32, pixels=128),
+            AdversarialConfig(steps=2, coarse=0.5, batch_size=2, learning_rate=1e-6, fine_learning_rate=1e-6),
+            PaperTrainingConfig(
+                steps=1, batch_size=2, critic_steps=1, generator_learning_rate=1e-6, discriminator_stride=2
+            ),
+        ),
     )
     losses: dict[str, float] = {}
-    kept: HallucinationGenerator = generator
-    for kept, found in steps:  # noqa: B007 (the last one)
-        losses |= found
+    for _ in range(63):
+        losses |= training.step()
     assert set(losses) == set(LOSSES)
+    with pytest.raises(StopIteration):
+        training.step()
+    kept = training.average
 
     path = tmp_path / "generator.safetensors"
     save_weights(path, kept, {"kind": "coordinates", "arguments": kept.arguments})

@@ -13,27 +13,24 @@ from safetensors.torch import load_file
 import halgan_envs
 from halgan_rl.experiment import generator_run
 from halgan_rl.experiment.domain import Domain
-from halgan_rl.experiment.generator_run import COLUMNS, GeneratorRunConfig
-from halgan_rl.experiment.presets import parse_config
+from halgan_rl.experiment.generator_run import COLUMNS, DataConfig, GeneratorRunConfig
+from halgan_rl.experiment.presets import changed, parse_config
 from halgan_rl.experiment.run_folder import read_metrics
 from halgan_rl.hallucination.generators.base import HallucinationGenerator
-from halgan_rl.hallucination.generators.config import GeneratorConfig
 from halgan_rl.hallucination.hallucinators import GeneratorHallucinator
 from halgan_rl.hallucination.training.adversarial import AdversarialConfig
 from halgan_rl.hallucination.training.matte_regression import MatteConfig
+from halgan_rl.hallucination.training.steps import GeneratorTrainingConfig
 from halgan_rl.hallucination.weights import load_generator
-from recipes import train_generator
-from recipes.train_generator import PRESETS, Config, main
+from recipes.train_generator import PRESETS, main
 from tests import synthetic
 
-TINY = Config(
-    near_goal_frames=40,
-    failed_frames=40,
-    held_out_frames=4,
+TINY = GeneratorRunConfig(
     evaluate_every=2,
-    mattes=MatteConfig(steps=2),
-    adversarial=AdversarialConfig(steps=2, batch_size=4, critic_steps=1, bandwidth=0.1),
+    data=DataConfig(near_goal_frames=40, failed_frames=40, held_out_frames=4),
+    training=GeneratorTrainingConfig(mattes=MatteConfig(steps=2), adversarial=AdversarialConfig(steps=2, batch_size=4)),
 )
+NOT_ADVERSARIAL = AdversarialConfig(steps=0)
 
 
 def load(run: Path) -> HallucinationGenerator:
@@ -55,12 +52,13 @@ def test_everything_promised_is_written(run: Path) -> None:
         "generator.safetensors",
         "hallucinations.png",
         "metrics.csv",
+        "state.safetensors",
     }
     metrics = read_metrics(run / "metrics.csv")
     assert metrics["steps"] == [2, 4]
-    assert not math.isnan(metrics["adversarial/critic_distance"][-1])
+    assert not math.isnan(metrics["adversarial/critic_gap"][-1])
     manifest = json.loads((run / "generator.json").read_text())
-    assert manifest["config"]["near_goal_frames"] == 40
+    assert manifest["config"]["data"]["near_goal_frames"] == 40
     assert {"command", "golden_frame", "mujoco", "versions"} <= set(manifest)
 
 
@@ -74,7 +72,7 @@ def test_a_run_repeats_itself_and_every_weight_is_trained(run: Path, tmp_path: P
     weights = {"first": load_file(run / "generator.safetensors")}
     changes: dict[str, dict[str, Any]] = {
         "again": {},
-        "regression": {"adversarial": dataclasses.replace(TINY.adversarial, steps=0)},
+        "regression": {"training": changed(TINY.training, {"adversarial.steps": 0})},
         "seed": {"seed": 1},
     }
     for name, change in changes.items():
@@ -97,41 +95,47 @@ def test_training_ends_when_its_minutes_are_over_and_keeps_what_it_has(tmp_path:
 def test_the_papers_generator_composes_as_configured(
     tmp_path: Path, composition: Literal["dimming", "difference"]
 ) -> None:
-    config = dataclasses.replace(
-        TINY,
-        out=tmp_path / "run",
-        mattes=MatteConfig(steps=0),
-        generator=GeneratorConfig(kind="paper", composition=composition),
-    )
-    main(config)
+    changes = {"out": tmp_path / "run", "training.mattes.steps": 0, "generator.kind": "paper"}
+    main(changed(TINY, changes | {"generator.composition": composition}))
     grey = torch.full((1, 3, 64, 64), 0.5)
     composed = load(tmp_path / "run").compose(grey, torch.zeros_like(grey))
     assert torch.equal(composed, grey) == (composition == "difference")
 
 
-@pytest.mark.parametrize(("environment", "noise"), [("pebble", 0.05), ("navigate-2m", 0.7)])
-def test_latents_have_as_much_noise_as_suits_the_environment(
-    environment: str, noise: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_resumed_run_ends_as_if_it_had_never_stopped(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    seen = []
+    """It stops within the first stage, and between its evaluations: steps after the last one are made again."""
+    out = tmp_path / "run"
+    stop, goes_on = dataclasses.replace(TINY, out=out, evaluate_every=1), dataclasses.replace(TINY, out=out)
+    main(dataclasses.replace(stop, minutes=1e-6))
+    assert read_metrics(out / "metrics.csv")["steps"] == [1]
+    with pytest.raises(ValueError, match="cannot be resumed with other values of evaluate_every"):
+        main(dataclasses.replace(goes_on, resume=True))
+    with (out / "metrics.csv").open("a") as file:
+        file.write(",".join(["2"] * len(COLUMNS)) + "\n")
+    main(dataclasses.replace(stop, resume=True))
+    assert read_metrics(out / "metrics.csv")["steps"] == [1, 2, 3, 4]
+    weights, whole = (load_file(folder / "generator.safetensors") for folder in (out, run))
+    assert all(torch.equal(weights[name], whole[name]) for name in whole)
+    before = (out / "metrics.csv").read_text()
+    main(dataclasses.replace(stop, resume=True))  # nothing is left to do
+    assert (out / "metrics.csv").read_text() == before
+    assert "nan" not in capsys.readouterr().out
 
-    def spy(config: Config, *_: Any, **__: Any) -> dict[str, float]:
-        seen.append(config.latent_noise)
-        return dict.fromkeys(COLUMNS, 0.0)
 
-    monkeypatch.setattr(train_generator, "run", spy)
-    monkeypatch.setattr(train_generator, "collect", lambda *_: {})
-    monkeypatch.setattr(train_generator, "render_truth", lambda *_: {})
-    main(dataclasses.replace(TINY, environment=environment, out=tmp_path / "run"))
-    main(dataclasses.replace(TINY, environment=environment, out=tmp_path / "run", latent_noise=0.3))
-    assert seen == [noise, 0.3]
+def test_there_must_be_something_to_resume(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="nothing to go on from"):
+        main(dataclasses.replace(TINY, out=tmp_path / "run", resume=True))
+    assert not (tmp_path / "run").exists()
 
 
 def test_frames_of_any_shape_without_a_simulator_make_a_generator(tmp_path: Path) -> None:
     """A user's domain: no truth to compare with, no fingerprint, grey frames of 48 x 32 pixels."""
     shape = (48, 32, 1)
     domain = Domain("mine", make=None, action_spec=None, image_shape=shape)  # type: ignore[arg-type]
-    config = GeneratorRunConfig(environment="mine", out=tmp_path / "run", mattes=MatteConfig(steps=2, batch_size=4))
+    training = GeneratorTrainingConfig(MatteConfig(steps=2, batch_size=4), NOT_ADVERSARIAL)
+    config = GeneratorRunConfig(environment="mine", out=tmp_path / "run", training=training)
     data = {"near_goal": synthetic.near_goal(16, image_shape=shape), "failed": synthetic.failed(16, image_shape=shape)}
     assert math.isnan(generator_run.run(config, domain, **data)["truth/mask_overlap"])
     path = tmp_path / "run" / "generator.safetensors"
@@ -141,7 +145,8 @@ def test_frames_of_any_shape_without_a_simulator_make_a_generator(tmp_path: Path
 def test_stacked_grey_frames_are_compared_with_the_truth_and_drawn(tmp_path: Path) -> None:
     shape: dict[str, Any] = {"image_shape": (48, 32, 2), "frame_stack": 2}
     domain = Domain("mine", make=None, action_spec=None, **shape)  # type: ignore[arg-type]
-    config = GeneratorRunConfig(environment="mine", out=tmp_path / "run", mattes=MatteConfig(steps=1, batch_size=4))
+    training = GeneratorTrainingConfig(MatteConfig(steps=1, batch_size=4), NOT_ADVERSARIAL)
+    config = GeneratorRunConfig(environment="mine", out=tmp_path / "run", training=training)
     near_goal = synthetic.near_goal(16, **shape)
     held_out = near_goal | {"pixels": near_goal["empty"], "truth": near_goal["pixels"]}
     data = {"near_goal": near_goal, "failed": synthetic.failed(16, **shape)}
@@ -173,23 +178,20 @@ def test_an_unknown_environment_is_refused_with_those_there_are_before_the_folde
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"near_goal_frames": 0}, "near_goal_frames"),
-        ({"steps_before_goal": -1}, "steps_before_goal"),
+        ({"data.near_goal_frames": 0}, "near_goal_frames"),
+        ({"data.steps_before_goal": -1}, "steps_before_goal"),
         ({"minutes": 0}, "minutes"),
         ({"evaluate_every": 0}, "evaluate_every"),
-        ({"latent_noise": 2.0}, "latent_noise"),
-        ({"generator": GeneratorConfig(kind="paper")}, "--mattes.steps 0"),
-        ({"mattes": MatteConfig(steps=0)}, "nothing to train"),
+        ({"generator.kind": "paper", "training.mattes.steps": 1}, "--training.mattes.steps 0"),
+        ({"training.mattes.steps": 0, "training.adversarial.steps": 0}, "nothing to train"),
     ],
 )
 def test_values_that_cannot_work_are_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        dataclasses.replace(Config(), **changes)
+        changed(TINY, changes)
 
 
 def test_the_preset_chooses_the_defaults_and_flags_win() -> None:
     assert parse_config(PRESETS, [], description=None) == PRESETS["default"]
-    config = parse_config(PRESETS, ["--preset", "paper", "--adversarial.critic-steps", "2"], description=None)
-    paper = PRESETS["paper"]
-    adversarial = dataclasses.replace(paper.adversarial, critic_steps=2)
-    assert config == dataclasses.replace(paper, adversarial=adversarial)
+    config = parse_config(PRESETS, ["--preset", "paper", "--training.paper.critic-steps", "2"], description=None)
+    assert config == changed(PRESETS["paper"], {"training.paper.critic_steps": 2})

@@ -69,8 +69,19 @@ class HallucinationGenerator(nn.Module, ABC):
         }
 
     @abstractmethod
-    def forward(self, features: Tensor, latent: Tensor) -> Tensor:
-        """Returns the change, float ``[N, D, H, W]``, for features ``[N, K]`` and latents ``[N, Z]``."""
+    def forward(self, features: Tensor, latent: Tensor, *, size: Sequence[int] | None = None) -> Tensor:
+        """Returns the change of images.
+
+        Args:
+            features: ``[N, K]``.
+            latent: ``[N, Z]``.
+
+        Keyword Args:
+            size: height h and width w to paint at, by default those of ``image_shape``.
+
+        Returns:
+            float ``[N, D, h, w]``.
+        """
 
     @abstractmethod
     def sample_latent(self, count: int, rng: torch.Generator) -> Tensor:

@@ -81,12 +81,14 @@ class CoordinateGenerator(HallucinationGenerator):
         with torch.no_grad():
             last.bias[: 2 * width].normal_(0, 1.5)
             matte.bias[channels:] = math.log(opacity / (1 - opacity))
-        self.register_buffer("coordinates", _pixel_coordinates(*self.image_shape[:2]), persistent=False)
+        self.register_buffer("coordinates", pixel_coordinates(*self.image_shape[:2]), persistent=False)
 
-    def forward(self, features: Tensor, latent: Tensor) -> Tensor:
-        """Returns mattes ``[N, C + S, H, W]``, in channels_last, for features ``[N, K]`` and latents ``[N, Z]``."""
-        matte = self.matte_at(self.coordinates, features, latent)
-        return matte.unflatten(1, self.image_shape[:2]).permute(0, 3, 1, 2)
+    def forward(self, features: Tensor, latent: Tensor, *, size: Sequence[int] | None = None) -> Tensor:
+        """Returns mattes ``[N, C + S, h, w]``, in channels_last, for features ``[N, K]`` and latents ``[N, Z]``."""
+        height, width = size = tuple(size or self.image_shape[:2])
+        whole = size == self.image_shape[:2]
+        coordinates = self.coordinates if whole else pixel_coordinates(height, width, features.device)
+        return self.matte_at(coordinates, features, latent).unflatten(1, size).permute(0, 3, 1, 2)
 
     def matte_at(self, coordinates: Tensor, features: Tensor, latent: Tensor) -> Tensor:
         """Returns mattes at some coordinates only, ``[N, M, C + S]``.
@@ -113,10 +115,10 @@ class CoordinateGenerator(HallucinationGenerator):
         return images + opacity * (colour - images)
 
 
-def _pixel_coordinates(height: int, width: int) -> Tensor:
+def pixel_coordinates(height: int, width: int, device: torch.device | None = None) -> Tensor:
     """Returns u to the right and v downwards, in (-1, 1), and 1 of each pixel's centre, ``[height * width, 3]``."""
     v, u = torch.meshgrid(_centres(height), _centres(width), indexing="ij")
-    return torch.stack([u, v, torch.ones_like(u)], -1).reshape(-1, 3)
+    return torch.stack([u, v, torch.ones_like(u)], -1).reshape(-1, 3).to(device)
 
 
 def _centres(count: int) -> Tensor:

@@ -83,6 +83,11 @@ class GoalEncoding(nn.Module):
         signs[1 : self.lengths + 1] = -1
         return labels * signs
 
+    def with_flags_of(self, labels: Tensor, others: Tensor) -> Tensor:
+        """Returns labels ``[..., L]`` with the flags of other labels."""
+        place = labels.shape[-1] - self.flags
+        return torch.cat([labels[..., :place], others[..., place:]], -1)
+
     def noise(self, length: float, angle: float) -> Tensor:
         """Returns standard deviations ``[L]``: of lengths [m], of the angle [rad], and 0 for flags."""
         return torch.tensor([length] * self.lengths + [angle] + [0.0] * self.flags)

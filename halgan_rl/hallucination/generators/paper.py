@@ -62,9 +62,10 @@ class PaperGenerator(HallucinationGenerator):
         self.layers = nn.Sequential(*layers)
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
-    def forward(self, features: Tensor, latent: Tensor) -> Tensor:
-        """Returns H ``[N, C, H, W]`` in [-1, 1] for features ``[N, K]`` and latents ``[N, Z]``."""
-        return self.layers((self.embedding(features) * latent)[:, :, None, None])
+    def forward(self, features: Tensor, latent: Tensor, *, size: Sequence[int] | None = None) -> Tensor:
+        """Returns H ``[N, C, h, w]`` in [-1, 1] for features ``[N, K]`` and latents ``[N, Z]``, averaged if smaller."""
+        change: Tensor = self.layers((self.embedding(features) * latent)[:, :, None, None])
+        return change if size is None else nn.functional.adaptive_avg_pool2d(change, (size[0], size[1]))
 
     def sample_latent(self, count: int, rng: torch.Generator) -> Tensor:
         """Draws latents ``[count, Z]`` from N(1, 0.1)."""

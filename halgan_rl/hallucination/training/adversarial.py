@@ -1,225 +1,265 @@
-"""Adversarial training of a generator: a conditional Wasserstein GAN with a regression auxiliary task.
+"""Adversarial training of a generator: a relativistic game in which critic and generator both know the pose.
 
-Source: Sahni et al., NeurIPS 2019, section 3 and appendix; gradient penalty from Gulrajani et al., NeurIPS 2017.
+Four things make it work, see ``results/generators.md``:
+
+- The critic judges an image *under a configuration* (:class:`~.critic.PoseCritic`): a goal in the wrong place is as
+  wrong as no goal.
+- Real images under wrong configurations are fakes, too: they show the critic what a configuration means.
+- Fakes are painted into failed frames that are seen from where the real ones are (:mod:`~.matching`), under the same
+  configuration: only the goal tells the two apart.
+- The loss compares each fake with a real image, softplus(D(fake, c) - D(real, c)), and the critic's slope at real
+  images is kept small (R1). Source: Jolicoeur-Martineau, "The relativistic discriminator", ICLR 2019; Huang et al.,
+  "The GAN is dead; long live the GAN!" (R3GAN), NeurIPS 2024; R1: Mescheder et al., ICML 2018.
+
+Training starts with coarse images, half as high and as wide. No colours are looked at, and no goal is masked.
 """
 
+from copy import deepcopy
 from dataclasses import dataclass
-from typing import cast
+from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.nn import functional
 
 from halgan_rl.hallucination.generators.base import HallucinationGenerator
-from halgan_rl.hallucination.training.data import Frames, check_data, matching_settings
-from halgan_rl.hallucination.training.discriminator import Discriminator
+from halgan_rl.hallucination.training.critic import PoseCritic
+from halgan_rl.hallucination.training.data import Frames, check_data
+from halgan_rl.hallucination.training.matching import nearest_backgrounds
 from halgan_rl.poses import PlanarPoses
 from halgan_rl.transforms.pixels import to_float
 
 
 @dataclass(frozen=True)
 class AdversarialConfig:
-    """How generators are trained adversarially; the defaults are the paper's.
+    """How generators are trained adversarially.
 
     Raises:
-        ValueError: if a count is out of range.
+        ValueError: if a value is out of range.
     """
 
-    steps: int = 50_000
-    """Generator steps; 0 leaves adversarial training out."""
-
-    batch_size: int = 64
-    """Images of a batch, real ones and fake ones each."""
-    critic_steps: int = 5
-    """Discriminator steps before each generator step."""
-    generator_learning_rate: float = 1e-4
-    """Learning rate of the generator (Adam)."""
-    discriminator_learning_rate: float = 1e-4
-    """Learning rate of the discriminator (Adam)."""
-    betas: tuple[float, float] = (0.5, 0.9)
+    steps: int = 6_000
+    """Steps of adversarial training; 0 leaves it out."""
+    coarse: float = 0.6
+    """Fraction of the steps, the first ones, with images of half the height and width."""
+    batch_size: int = 32
+    """Real images of a step, and fake ones."""
+    learning_rate: float = 1e-3
+    """Learning rate of both networks (Adam) with coarse images; it falls linearly in the second half."""
+    fine_learning_rate: float = 5e-4
+    """Learning rate with whole images; it falls likewise."""
+    betas: tuple[float, float] = (0.0, 0.99)
     """Adam's decay rates."""
-    auxiliary_weight: float = 10.0
-    """Weight of the regression of the configuration."""
-    penalty_weight: float = 10.0
-    """Weight of the gradient penalty."""
-    penalty_interval: int = 1
-    """Discriminator steps from one gradient penalty to the next; its weight grows as much (StyleGAN2's trick)."""
-    change_weight: float = 1.0
-    """Weight of the mean square of what the generator changes in the image."""
+    penalty_weight: float = 0.3
+    """Weight of the critic's squared slope at real images (R1) with coarse images."""
+    fine_penalty_weight: float = 3.0
+    """Weight of it with whole images, by which the critic overfits sooner."""
+    penalty_interval: int = 8
+    """Steps from one penalty to the next; its weight grows as much (StyleGAN2's trick)."""
+    wrong_pose_weight: float = 1.0
+    """Weight of telling real images under their configuration from the same under another's."""
+    painted_maps: bool = True
+    """Show the critic where in the image the goal must be seen, instead of comparing summaries alone."""
     label_noise: tuple[float, float] = (0.01, 0.02)
-    """Standard deviation of the noise on the labels of real images: lengths [m], angles [rad]."""
-    bandwidth: float = 1.0
-    """Width of the kernel density from which configurations of fakes are drawn, in units of Scott's rule."""
-    average_decay: float = 0.0
-    """Decay of the moving average of the generator's weights, which is what is kept; 0 keeps the last ones."""
-    discriminator_steps_ahead: int = 0
-    """Discriminator steps before the first generator step."""
+    """Standard deviation of the noise on configurations: lengths [m], angles [rad]."""
+    backgrounds: int = 4
+    """Failed frames to choose from for each real one, the nearest; 0: any with the same flags."""
+    average_decay: float = 0.998
+    """Decay of the moving average of the generator's weights, which is what is kept; it is less at first."""
 
     def __post_init__(self) -> None:
         """Refuses values that make no sense."""
-        for name, least in (("steps", 0), ("batch_size", 1), ("critic_steps", 1), ("penalty_interval", 1)):
+        for name, least in (("steps", 0), ("batch_size", 2), ("penalty_interval", 1), ("backgrounds", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name}={getattr(self, name)} must be at least {least}.")
+        for name in ("coarse", "average_decay"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name}={getattr(self, name)} must be within [0, 1]: it is a fraction.")
+        for name in ("learning_rate", "fine_learning_rate"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}={getattr(self, name)} must be positive.")
+
+    @property
+    def coarse_steps(self) -> int:
+        """Steps with coarse images."""
+        return round(self.coarse * self.steps)
+
+    def rate_at(self, step: int) -> float:
+        """Returns the learning rate of a step, counted from 0."""
+        coarse = step < self.coarse_steps
+        first, last = (0, self.coarse_steps) if coarse else (self.coarse_steps, self.steps)
+        left = 1 - (step - first) / (last - first)
+        return (self.learning_rate if coarse else self.fine_learning_rate) * min(1.0, 2 * left)
 
 
 class AdversarialTrainer:
-    """Trains generator and discriminator against each other, one generator step a call.
+    """Trains a generator against a critic that knows the pose, one step of both a call.
 
     Args:
-        generator: learns to draw the goal; its encoding is used as it is.
-        discriminator: learns to judge realism and to regress the configuration's features.
+        generator: learns to paint the goal; its encoding is used as it is.
 
     Keyword Args:
         near_goal: ``pixels`` uint8 ``[N, H, W, C]``, ``pose`` and ``goal_pose`` ``[N, P]`` of near-goal frames.
-        failed: ``pixels`` uint8 ``[M, H, W, C]`` and ``pose`` ``[M, P]`` of failed frames, into which goals are
-            painted: those that the poses' flags select.
+        failed: ``pixels`` uint8 ``[M, H, W, C]`` and ``pose`` ``[M, P]`` of failed frames.
         config: hyper-parameters.
-        rng: draws everything that is random.
+        rng: draws everything that is random, except the critic's first weights (PyTorch's global generator).
         poses: which entries of a pose are flags; each setting of them has a goal of its own.
-        mirror: mirror half of the real images left to right, and their labels with them.
+        mirror: whether half of the images are mirrored left to right, where the task is symmetric.
+
+    Attributes:
+        average: the generator whose weights are worth keeping, the moving average.
+        steps: made so far.
 
     Raises:
         KeyError: if an entry of the frames is missing.
-        ValueError: if frames or poses are other than the generator's.
+        ValueError: if frames or poses are other than the generator's, or images too small for the critic.
     """
 
     def __init__(
         self,
         generator: HallucinationGenerator,
-        discriminator: Discriminator,
         *,
         near_goal: Frames,
         failed: Frames,
         config: AdversarialConfig,
         rng: torch.Generator,
         poses: PlanarPoses = PlanarPoses(),
-        mirror: bool = False,
+        mirror: bool = True,
     ) -> None:
         check_data(generator, near_goal, failed, poses)
-        self.generator, self.discriminator, self.config, self.rng = generator, discriminator, config, rng
-        self._mirror = mirror
-        self._encoding = generator.encoding
-        self._real_pixels, self._failed_pixels = near_goal["pixels"], failed["pixels"]
-        self._real_settings, self._failed_settings = matching_settings(near_goal, failed, poses)
-        self._labels = self._encoding.labels(near_goal["pose"], near_goal["goal_pose"])
-        self._noise = self._encoding.noise(*config.label_noise)
-        self._kernel = config.bandwidth * scott_kernel(self._labels, flags=self._encoding.flags)
-        self._generator_optimizer, self._discriminator_optimizer = (
-            torch.optim.Adam(network.parameters(), lr=rate, betas=config.betas)
-            for network, rate in (
-                (generator, config.generator_learning_rate),
-                (discriminator, config.discriminator_learning_rate),
-            )
+        self.generator, self.config, self.rng = generator, config, rng
+        self.critic = PoseCritic(
+            generator.encoding.size, image_shape=generator.image_shape, painted_maps=config.painted_maps
         )
-        average = get_ema_multi_avg_fn(config.average_decay)
-        self._average = AveragedModel(generator, multi_avg_fn=average, use_buffers=True)
-        self._penalty_countdown = 0
-        self._ahead = config.discriminator_steps_ahead
-
-    @property
-    def average(self) -> HallucinationGenerator:
-        """The generator whose weights are worth keeping: the moving average."""
-        return cast(HallucinationGenerator, self._average.module)
+        self.average = deepcopy(generator)
+        self.steps = 0
+        self._encoding, self._mirror = generator.encoding, mirror
+        self._real_pixels, self._failed_pixels = near_goal["pixels"], failed["pixels"]
+        self._labels = generator.encoding.labels(near_goal["pose"], near_goal["goal_pose"])
+        self._noise = generator.encoding.noise(*config.label_noise)
+        count = config.backgrounds or len(failed["pose"])
+        self._backgrounds = nearest_backgrounds(near_goal, failed, poses, count=count)
+        self._optimizers = {
+            name: torch.optim.Adam(network.parameters(), lr=config.learning_rate, betas=config.betas)
+            for name, network in (("generator", generator), ("critic", self.critic))
+        }
 
     def step(self) -> dict[str, Tensor]:
-        """Trains the discriminator, then the generator.
+        """Trains the critic, then the generator.
 
         Returns:
-            Scalars: ``critic_distance``, the estimate of the Wasserstein distance; ``auxiliary_real`` and
-            ``auxiliary_fake``, mean square errors of the regressed features; ``change``, the mean square of what the
-            generator changes in images in [-1, 1].
+            Scalars: ``critic_gap``, by how much real images score better than fakes; ``wrong_pose_gap``, by how much
+            better than themselves under another configuration; ``slope``, the critic's mean squared slope at real
+            images, NaN where it is not penalised.
         """
-        metrics: dict[str, Tensor] = {}
-        for _ in range(self.config.critic_steps + self._ahead):
-            metrics |= self._train_discriminator()
-        self._ahead = 0
-        metrics |= self._train_generator()
-        self._average.update_parameters(self.generator)
+        coarse = self.steps < self.config.coarse_steps
+        for optimizer in self._optimizers.values():
+            optimizer.param_groups[0]["lr"] = self.config.rate_at(self.steps)
+        real, background, features, wrong = self._draw(coarse=coarse)
+        fake = self._paint(background, features, coarse=coarse)
+        metrics = self._train_critic(real, fake.detach(), features, wrong, coarse=coarse)
+        self._train_generator(real, fake, features, coarse=coarse)
+        self.steps += 1
+        self._update_average()
         return metrics
 
-    def _train_discriminator(self) -> dict[str, Tensor]:
-        """Tells real from fake, and regresses the configurations of real images."""
-        config = self.config
-        real, features = self._draw_real()
+    def networks(self) -> dict[str, nn.Module]:
+        """Returns generator, its average, and critic, by name."""
+        return {"generator": self.generator, "average": self.average, "critic": self.critic}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns all that training goes on from: networks, optimizers, steps, and the state of the random draws."""
+        return {
+            **{name: network.state_dict() for name, network in self.networks().items()},
+            "optimizers": {name: optimizer.state_dict() for name, optimizer in self._optimizers.items()},
+            "rng": self.rng.get_state(),
+            "steps": self.steps,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on from a state; the data, the configuration and the networks' shapes must be the same."""
+        for name, network in self.networks().items():
+            network.load_state_dict(state[name])
+        for name, optimizer in self._optimizers.items():
+            optimizer.load_state_dict(state["optimizers"][name])
+        self.rng.set_state(state["rng"])
+        self.steps = state["steps"]
+
+    def _train_critic(
+        self, real: Tensor, fake: Tensor, features: Tensor, wrong: Tensor, *, coarse: bool
+    ) -> dict[str, Tensor]:
+        """Prefers real images to fakes, and to themselves under other configurations."""
+        config, critic = self.config, self.critic
+        seen = [part.chunk(2) for part in critic.look(torch.cat([real, fake]), coarse=coarse)]
+        real_seen, fake_seen = zip(*seen, strict=True)
+        score = critic.score(real_seen, features)
+        gap = score - critic.score(fake_seen, features)
+        wrong_gap = score - critic.score(real_seen, wrong)
+        loss = functional.softplus(-gap).mean() + config.wrong_pose_weight * functional.softplus(-wrong_gap).mean()
+        slope = torch.full((), torch.nan)
+        if self.steps % config.penalty_interval == 0:
+            slope = self._slope(real, features, coarse=coarse)
+            weight = config.penalty_weight if coarse else config.fine_penalty_weight
+            loss = loss + config.penalty_interval * weight / 2 * slope
+        self._descend("critic", loss)
+        return {
+            "critic_gap": gap.mean().detach(),
+            "wrong_pose_gap": wrong_gap.mean().detach(),
+            "slope": slope.detach(),
+        }
+
+    def _slope(self, real: Tensor, features: Tensor, *, coarse: bool) -> Tensor:
+        """Returns the mean squared norm of the score's gradient in the images."""
+        images = real.clone().requires_grad_()
+        score = self.critic.score(self.critic.look(images, coarse=coarse), features)
+        (slope,) = torch.autograd.grad(score.sum(), images, create_graph=True)
+        return slope.square().sum((1, 2, 3)).mean()
+
+    def _train_generator(self, real: Tensor, fake: Tensor, features: Tensor, *, coarse: bool) -> None:
+        """Makes fakes that the critic prefers to real images."""
+        critic = self.critic
         with torch.no_grad():
-            _, _, fake = self._draw_fake()
-        real_score, guess = self.discriminator(real)
-        fake_score, _ = self.discriminator(fake)
-        distance = real_score.mean() - fake_score.mean()
-        auxiliary = nn.functional.mse_loss(guess, features)
-        loss = config.auxiliary_weight * auxiliary - distance
-        if self._penalty_countdown == 0:
-            self._penalty_countdown = config.penalty_interval
-            penalty = self._gradient_penalty(real, fake)
-            loss = loss + config.penalty_interval * config.penalty_weight * penalty
-        self._penalty_countdown -= 1
-        _descend(self._discriminator_optimizer, loss)
-        return {"critic_distance": distance.detach(), "auxiliary_real": auxiliary.detach()}
+            score = critic.score(critic.look(real, coarse=coarse), features)
+        critic.requires_grad_(False)
+        gap = score - critic.score(critic.look(fake, coarse=coarse), features)
+        critic.requires_grad_(True)
+        self._descend("generator", functional.softplus(gap).mean())
 
-    def _train_generator(self) -> dict[str, Tensor]:
-        """Makes goals that the critic takes for real, at their configurations, and that change little."""
-        config = self.config
-        images, features, fake = self._draw_fake()
-        score, guess = self.discriminator(fake)
-        auxiliary = nn.functional.mse_loss(guess, features)
-        change = (fake - images).square().mean()
-        loss = config.auxiliary_weight * auxiliary + config.change_weight * change - score.mean()
-        _descend(self._generator_optimizer, loss)
-        return {"auxiliary_fake": auxiliary.detach(), "change": change.detach()}
+    def _descend(self, name: str, loss: Tensor) -> None:
+        self._optimizers[name].zero_grad()
+        loss.backward()
+        self._optimizers[name].step()
 
-    def _gradient_penalty(self, real: Tensor, fake: Tensor) -> Tensor:
-        """Returns the mean square deviation from 1 of the critic's slope between real and fake images."""
-        mix = torch.rand(len(real), 1, 1, 1, generator=self.rng)
-        between = torch.lerp(real, fake, mix).requires_grad_()
-        score, _ = self.discriminator(between)
-        (slope,) = torch.autograd.grad(score.sum(), between, create_graph=True)
-        return (slope.flatten(1).norm(dim=1) - 1).square().mean()
+    @torch.no_grad()
+    def _update_average(self) -> None:
+        """Follows the generator: closely at first, or the average would hold on to its first weights."""
+        decay = min(self.config.average_decay, (1 + self.steps) / (10 + self.steps))
+        for kept, new in zip(self.average.parameters(), self.generator.parameters(), strict=True):
+            kept.lerp_(new, 1 - decay)
+        for copy, now in zip(self.average.buffers(), self.generator.buffers(), strict=True):
+            copy.copy_(now)
 
-    def _draw_real(self) -> tuple[Tensor, Tensor]:
-        """Draws near-goal images and the features of their noisy labels."""
-        rows, flip = self._draw_rows()
-        images, labels = to_float(self._real_pixels[rows]), self._mirror_labels(rows, flip)
-        images = torch.where(flip[:, None, None, None], images.flip(3), images)
-        return images, self._encoding(labels + self._noise * torch.randn(labels.shape, generator=self.rng))
+    def _draw(self, *, coarse: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Draws real images and matching backgrounds, mirrored alike, their configurations, and wrong ones."""
+        count = self.config.batch_size
+        rows = torch.randint(len(self._labels), (count,), generator=self.rng)
+        choice = torch.randint(self._backgrounds.shape[1], (count,), generator=self.rng)
+        flip = (torch.rand(count, generator=self.rng) < 0.5) & self._mirror
+        labels = torch.where(flip[:, None], self._encoding.mirror(self._labels[rows]), self._labels[rows])
+        labels = labels + self._noise * torch.randn(labels.shape, generator=self.rng)
+        wrong = self._encoding.with_flags_of(labels.roll(1, 0), labels)
+        images = self._real_pixels[rows], self._failed_pixels[self._backgrounds[rows, choice]]
+        real, background = (_prepare(pixels, flip, coarse=coarse) for pixels in images)
+        return real, background, self._encoding(labels), self._encoding(wrong)
 
-    def _draw_fake(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Draws failed images and features from the kernel density; returns both, and the images with goals."""
-        rows, flip = self._draw_rows()
-        labels = self._mirror_labels(rows, flip)
-        features = self._encoding(labels + torch.randn(labels.shape, generator=self.rng) @ self._kernel.T)
-        same_goal = self._real_settings[rows, None] == self._failed_settings
-        images = to_float(self._failed_pixels[same_goal.float().multinomial(1, generator=self.rng).squeeze(1)])
-        latent = self.generator.sample_latent(len(labels), self.rng)
-        return images, features, self.generator.compose(images, self.generator(features, latent))
-
-    def _draw_rows(self) -> tuple[Tensor, Tensor]:
-        """Draws rows of the near-goal data, and which of them to mirror."""
-        size = (self.config.batch_size,)
-        rows = torch.randint(len(self._labels), size, generator=self.rng)
-        return rows, (torch.rand(size, generator=self.rng) < 0.5) & self._mirror
-
-    def _mirror_labels(self, rows: Tensor, flip: Tensor) -> Tensor:
-        labels = self._labels[rows]
-        return torch.where(flip[:, None], self._encoding.mirror(labels), labels)
+    def _paint(self, background: Tensor, features: Tensor, *, coarse: bool) -> Tensor:
+        """Returns the background with goals painted in, in its own resolution."""
+        latent = self.generator.sample_latent(len(features), self.rng)
+        return self.generator.compose(background, self.generator(features, latent, size=background.shape[2:]))
 
 
-def scott_kernel(labels: Tensor, *, flags: int = 0) -> Tensor:
-    """Returns a factor of the covariance of a Gaussian kernel density by Scott's rule.
-
-    Args:
-        labels: ``[N, L]``.
-        flags: how many of them, at the end, are flags, which the kernel leaves as they are.
-
-    Returns:
-        ``[L, L]`` such that ``label + kernel @ standard_normal`` draws from the density, label being any of the N.
-    """
-    count, size = len(labels), labels.shape[1] - flags
-    covariance = torch.cov(labels[:, :size].T).reshape(size, size) + 1e-12 * torch.eye(size)
-    factor = count ** (-1 / (size + 4)) * torch.linalg.cholesky(covariance)
-    return nn.functional.pad(factor, (0, flags, 0, flags))
-
-
-def _descend(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
-    optimizer.zero_grad()
-    loss.backward()
-    optimizer.step()
+def _prepare(pixels: Tensor, flip: Tensor, *, coarse: bool) -> Tensor:
+    """Returns images ``[N, C, H, W]`` for uint8 ``[N, H, W, C]``, some of them mirrored, in half the size if coarse."""
+    images = to_float(pixels)
+    images = torch.where(flip[:, None, None, None], images.flip(3), images)
+    return functional.avg_pool2d(images, 2) if coarse else images

@@ -10,8 +10,8 @@ generative networks", ICML 2018).
 Not in the paper; goals without a colour of their own need adversarial training.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -43,6 +43,10 @@ class MatteConfig:
     """Random pixels of each frame of a step; the generator's cost is that of the pixels that it computes."""
     learning_rate: float = 4e-3
     """Learning rate at first; it falls linearly to a twentieth."""
+    latent_noise: float = 0.7
+    """Fraction of noise in the latents. The more of it, the less they say where the goal of a rollout is, as the poses
+    should; what neither says comes out blurred. A goal that is small beside the places where it counts as reached wants
+    little noise."""
 
     def __post_init__(self) -> None:
         """Refuses values that make no sense."""
@@ -51,20 +55,12 @@ class MatteConfig:
                 raise ValueError(f"{name}={getattr(self, name)} must be at least {least}.")
         if not self.learning_rate > 0:
             raise ValueError(f"learning_rate={self.learning_rate} must be positive.")
+        if not 0 <= self.latent_noise <= 1:
+            raise ValueError(f"latent_noise={self.latent_noise} must be within [0, 1]: it is a fraction.")
 
 
-def fit_mattes(
-    generator: HallucinationGenerator,
-    *,
-    near_goal: Frames,
-    failed: Frames,
-    rng: torch.Generator,
-    config: MatteConfig = MatteConfig(),
-    poses: PlanarPoses = PlanarPoses(),
-    mirror: bool = True,
-    latent_noise: float = 0.7,
-) -> Iterator[float]:
-    """Fits a generator's mattes to the goals of near-goal frames.
+class MatteRegression:
+    """Fits a generator's mattes to the goals of near-goal frames, one step a call.
 
     Args:
         generator: a ``CoordinateGenerator``, trained in place; its encoding must be standardised.
@@ -77,45 +73,68 @@ def fit_mattes(
         config: how long, and how fast.
         poses: which entries of a pose are flags; each setting of them has a goal of its own.
         mirror: whether half of the frames are mirrored left to right, where the task is symmetric.
-        latent_noise: fraction of noise in the latents, in [0, 1]. The more of it, the less they say where the goal of a
-            rollout is, as the poses should; what neither says comes out blurred. A goal that is small beside the
-            places where it counts as reached wants little noise.
 
-    Returns:
-        An iterator that makes one step at a time and gives the loss after it.
+    Attributes:
+        average: the generator whose weights are worth keeping: the generator itself.
 
     Raises:
         KeyError: if an entry of the frames is missing.
-        ValueError: if the generator has no mattes, frames or poses are other than the generator's, the noise is out of
-            range, or no colour is the goal's.
+        ValueError: if the generator has no mattes, frames or poses are other than the generator's, or no colour is
+            the goal's.
     """
-    if not isinstance(generator, CoordinateGenerator):
-        raise ValueError(f"{type(generator).__name__} has no mattes to fit: use a CoordinateGenerator.")
-    if not 0 <= latent_noise <= 1:
-        raise ValueError(f"latent_noise={latent_noise} must be within [0, 1]: it is a fraction.")
-    check_data(generator, near_goal, failed, poses)
-    settings, is_goal = _goal_colours_by_setting(generator, near_goal, failed, poses)
-    batches = _Batches(generator, near_goal, rng=rng, config=config, mirror=mirror, latent_noise=latent_noise)
-    return _fit(generator, batches, settings, is_goal, config)
 
+    def __init__(
+        self,
+        generator: HallucinationGenerator,
+        *,
+        near_goal: Frames,
+        failed: Frames,
+        rng: torch.Generator,
+        config: MatteConfig = MatteConfig(),
+        poses: PlanarPoses = PlanarPoses(),
+        mirror: bool = True,
+    ) -> None:
+        if not isinstance(generator, CoordinateGenerator):
+            raise ValueError(f"{type(generator).__name__} has no mattes to fit: use a CoordinateGenerator.")
+        check_data(generator, near_goal, failed, poses)
+        self.average = self._generator = generator
+        self._rng = rng
+        self._settings, self._is_goal = _goal_colours_by_setting(generator, near_goal, failed, poses)
+        self._batches = _Batches(generator, near_goal, rng=rng, config=config, mirror=mirror)
+        self._optimizer = torch.optim.Adam(generator.parameters(), lr=config.learning_rate, betas=(0.9, 0.99))
+        latents = {"params": [self._batches.latents], "lr": LATENT_RATE * config.learning_rate}
+        self._optimizer.add_param_group(latents)
+        self._schedule = torch.optim.lr_scheduler.LinearLR(self._optimizer, 1.0, 0.05, total_iters=config.steps)
 
-def _fit(
-    generator: CoordinateGenerator, batches: "_Batches", settings: Tensor, is_goal: Tensor, config: MatteConfig
-) -> Iterator[float]:
-    """Makes the steps; gives the loss after each."""
-    optimizer = torch.optim.Adam(generator.parameters(), lr=config.learning_rate, betas=(0.9, 0.99))
-    optimizer.add_param_group({"params": [batches.latents], "lr": LATENT_RATE * config.learning_rate})
-    schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.05, total_iters=config.steps)
-    for _ in range(config.steps):
-        rows, where, colours, features, latent = batches.draw()
-        matte = generator.matte_at(generator.coordinates[where], features, latent)
-        mask = is_goal[settings[rows, None, None], colour_index(colours)]
+    def step(self) -> dict[str, Tensor]:
+        """Makes a step; returns the ``loss``."""
+        rows, where, colours, features, latent = self._batches.draw()
+        matte = self._generator.matte_at(self._generator.coordinates[where], features, latent)
+        mask = self._is_goal[self._settings[rows, None, None], colour_index(colours)]
         loss = _matte_loss(matte, colours, mask.float())
-        optimizer.zero_grad()
+        self._optimizer.zero_grad()
         loss.backward()
-        optimizer.step()
-        schedule.step()
-        yield float(loss.detach())
+        self._optimizer.step()
+        self._schedule.step()
+        return {"loss": loss.detach()}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns all that training goes on from."""
+        return {
+            "generator": self._generator.state_dict(),
+            "latents": self._batches.latents.detach(),
+            "optimizer": self._optimizer.state_dict(),
+            "schedule": self._schedule.state_dict(),
+            "rng": self._rng.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on from a state; the data and the configuration must be the same."""
+        self._generator.load_state_dict(state["generator"])
+        self._batches.latents.data.copy_(state["latents"])
+        self._optimizer.load_state_dict(state["optimizer"])
+        self._schedule.load_state_dict(state["schedule"])
+        self._rng.set_state(state["rng"])
 
 
 class _Batches:
@@ -133,10 +152,9 @@ class _Batches:
         rng: torch.Generator,
         config: MatteConfig,
         mirror: bool,
-        latent_noise: float,
     ) -> None:
         self._generator, self._rng, self._config = generator, rng, config
-        self._mirror, self._latent_noise = mirror, latent_noise
+        self._mirror = mirror
         self._labels = generator.encoding.labels(near_goal["pose"], near_goal["goal_pose"])
         self._rollouts = torch.unique(near_goal["goal_pose"], dim=0, return_inverse=True)[1]
         self._count = int(self._rollouts.max()) + 1
@@ -166,8 +184,8 @@ class _Batches:
         """Returns the latents of the rows' rollouts, part of them noise, ``[B, Z]``: distributed as their prior."""
         standard = (self.latents - self.latents.mean(0)) / self.latents.std(0)
         noise = torch.randn(len(rows), self._generator.latent_size, generator=self._rng)
-        kept = (1 - self._latent_noise**2) ** 0.5
-        return kept * standard[self._rollouts[rows] + self._count * flip] + self._latent_noise * noise
+        fraction = self._config.latent_noise
+        return (1 - fraction**2) ** 0.5 * standard[self._rollouts[rows] + self._count * flip] + fraction * noise
 
 
 def _goal_colours_by_setting(
