@@ -49,9 +49,8 @@ Differences from the paper (Sahni et al., NeurIPS 2019, appendix); ``--preset pa
 from functools import partial
 
 import halgan_envs
-from halgan_rl.experiment.generator_run import DataConfig, GeneratorRunConfig, run
+from halgan_rl.experiment.generator_run import DataConfig, GeneratorRunConfig, prepare, run
 from halgan_rl.experiment.presets import changed, parse_config
-from halgan_rl.experiment.run_folder import check_unused
 from halgan_rl.hallucination.generators.config import GeneratorConfig
 from halgan_rl.hallucination.training.adversarial import AdversarialConfig
 from halgan_rl.hallucination.training.paper import PaperTrainingConfig
@@ -78,8 +77,7 @@ PRESETS = {
 
 def main(config: GeneratorRunConfig) -> None:
     """Collects frames, trains, compares with the truth, and writes everything into `config.out`."""
-    if not config.resume:
-        check_unused(config.out)
+    prepare(config)
     domain, data = halgan_envs.domain(config.environment), config.data
 
     # Frames near the goal and of failures, and held-out ones beside the truth.

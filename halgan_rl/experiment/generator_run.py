@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from halgan_rl.experiment import pictures
 from halgan_rl.experiment.domain import Domain
-from halgan_rl.experiment.run_folder import RunFolder, as_json, versions
+from halgan_rl.experiment.run_folder import RunFolder, as_json, check_unused, versions
 from halgan_rl.experiment.state_file import load_state, save_state
 from halgan_rl.hallucination.generators.base import HallucinationGenerator
 from halgan_rl.hallucination.generators.config import GeneratorConfig
@@ -155,16 +155,18 @@ def run(
     return metrics
 
 
-def open_folder(config: GeneratorRunConfig) -> tuple[RunFolder, dict[str, Any] | None]:
-    """Makes the folder of a run; or opens the one to resume, and reads its state.
+def prepare(config: GeneratorRunConfig) -> None:
+    """Refuses a folder that cannot be used; the first line of a recipe.
 
-    Metrics of steps after the state's are dropped: they are made again.
+    Raises:
+        FileExistsError: if the folder of the run already holds anything, unless it is resumed.
+        FileNotFoundError: if there is nothing to resume.
+        ValueError: if the run to resume has another configuration, or its state is damaged.
     """
     if not config.resume:
-        folder = RunFolder(config.out, columns=COLUMNS)
-        folder.write_config(dataclasses.asdict(config))
-        return folder, None
-    state = load_state(config.out / STATE)
+        check_unused(config.out)
+        return
+    load_state(config.out / STATE)
     written = json.loads((config.out / "config.json").read_text())["config"]
     now = json.loads(as_json(dataclasses.asdict(config)))
     different = [name for name in now if name not in MAY_DIFFER and written.get(name) != now[name]]
@@ -172,6 +174,19 @@ def open_folder(config: GeneratorRunConfig) -> tuple[RunFolder, dict[str, Any] |
         raise ValueError(
             f"{config.out} cannot be resumed with other values of {', '.join(different)}: pass those of its config.json"
         )
+
+
+def open_folder(config: GeneratorRunConfig) -> tuple[RunFolder, dict[str, Any] | None]:
+    """Makes the folder of a run; or opens the one to resume, and reads its state.
+
+    Metrics of steps after the state's are dropped: they are made again.
+    """
+    prepare(config)
+    if not config.resume:
+        folder = RunFolder(config.out, columns=COLUMNS)
+        folder.write_config(dataclasses.asdict(config))
+        return folder, None
+    state = load_state(config.out / STATE)
     steps = state["training"]["steps"]
     return RunFolder.reopen(config.out, columns=COLUMNS, keep=lambda row: float(row["steps"]) <= steps), state
 

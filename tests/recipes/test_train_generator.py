@@ -11,9 +11,7 @@ import torch
 from safetensors.torch import load_file
 
 import halgan_envs
-from halgan_rl.experiment import generator_run
-from halgan_rl.experiment.domain import Domain
-from halgan_rl.experiment.generator_run import COLUMNS, DataConfig, GeneratorRunConfig
+from halgan_rl.experiment.generator_run import DataConfig, GeneratorRunConfig
 from halgan_rl.experiment.presets import changed, parse_config
 from halgan_rl.experiment.run_folder import read_metrics
 from halgan_rl.hallucination.generators.base import HallucinationGenerator
@@ -23,14 +21,12 @@ from halgan_rl.hallucination.training.matte_regression import MatteConfig
 from halgan_rl.hallucination.training.steps import GeneratorTrainingConfig
 from halgan_rl.hallucination.weights import load_generator
 from recipes.train_generator import PRESETS, main
-from tests import synthetic
 
 TINY = GeneratorRunConfig(
     evaluate_every=2,
     data=DataConfig(near_goal_frames=40, failed_frames=40, held_out_frames=4),
     training=GeneratorTrainingConfig(mattes=MatteConfig(steps=2), adversarial=AdversarialConfig(steps=2, batch_size=4)),
 )
-NOT_ADVERSARIAL = AdversarialConfig(steps=0)
 
 
 def load(run: Path) -> HallucinationGenerator:
@@ -102,58 +98,10 @@ def test_the_papers_generator_composes_as_configured(
     assert torch.equal(composed, grey) == (composition == "difference")
 
 
-def test_a_resumed_run_ends_as_if_it_had_never_stopped(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """It stops within the first stage, and between its evaluations: steps after the last one are made again."""
-    out = tmp_path / "run"
-    stop, goes_on = dataclasses.replace(TINY, out=out, evaluate_every=1), dataclasses.replace(TINY, out=out)
-    main(dataclasses.replace(stop, minutes=1e-6))
-    assert read_metrics(out / "metrics.csv")["steps"] == [1]
-    with pytest.raises(ValueError, match="cannot be resumed with other values of evaluate_every"):
-        main(dataclasses.replace(goes_on, resume=True))
-    with (out / "metrics.csv").open("a") as file:
-        file.write(",".join(["2"] * len(COLUMNS)) + "\n")
-    main(dataclasses.replace(stop, resume=True))
-    assert read_metrics(out / "metrics.csv")["steps"] == [1, 2, 3, 4]
-    weights, whole = (load_file(folder / "generator.safetensors") for folder in (out, run))
-    assert all(torch.equal(weights[name], whole[name]) for name in whole)
-    before = (out / "metrics.csv").read_text()
-    main(dataclasses.replace(stop, resume=True))  # nothing is left to do
-    assert (out / "metrics.csv").read_text() == before
-    assert "nan" not in capsys.readouterr().out
-
-
 def test_there_must_be_something_to_resume(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="nothing to go on from"):
         main(dataclasses.replace(TINY, out=tmp_path / "run", resume=True))
     assert not (tmp_path / "run").exists()
-
-
-def test_frames_of_any_shape_without_a_simulator_make_a_generator(tmp_path: Path) -> None:
-    """A user's domain: no truth to compare with, no fingerprint, grey frames of 48 x 32 pixels."""
-    shape = (48, 32, 1)
-    domain = Domain("mine", make=None, action_spec=None, image_shape=shape)  # type: ignore[arg-type]
-    training = GeneratorTrainingConfig(MatteConfig(steps=2, batch_size=4), NOT_ADVERSARIAL)
-    config = GeneratorRunConfig(environment="mine", out=tmp_path / "run", training=training)
-    data = {"near_goal": synthetic.near_goal(16, image_shape=shape), "failed": synthetic.failed(16, image_shape=shape)}
-    assert math.isnan(generator_run.run(config, domain, **data)["truth/mask_overlap"])
-    path = tmp_path / "run" / "generator.safetensors"
-    assert load_generator(path, fingerprint={}, poses=domain.poses, image_shape=shape).image_shape == shape
-
-
-def test_stacked_grey_frames_are_compared_with_the_truth_and_drawn(tmp_path: Path) -> None:
-    shape: dict[str, Any] = {"image_shape": (48, 32, 2), "frame_stack": 2}
-    domain = Domain("mine", make=None, action_spec=None, **shape)  # type: ignore[arg-type]
-    training = GeneratorTrainingConfig(MatteConfig(steps=1, batch_size=4), NOT_ADVERSARIAL)
-    config = GeneratorRunConfig(environment="mine", out=tmp_path / "run", training=training)
-    near_goal = synthetic.near_goal(16, **shape)
-    held_out = near_goal | {"pixels": near_goal["empty"], "truth": near_goal["pixels"]}
-    data = {"near_goal": near_goal, "failed": synthetic.failed(16, **shape)}
-    assert generator_run.run(config, domain, **data, held_out=held_out)["truth/mask_overlap"] >= 0
-    assert (tmp_path / "run" / "hallucinations.png").exists()
-    with pytest.raises(ValueError, match=r"held_out\['truth'\] is torch.float32"):
-        generator_run.run(config, domain, **data, held_out=held_out | {"truth": held_out["truth"] / 255})
 
 
 def test_a_folder_that_holds_a_run_is_refused_first(tmp_path: Path) -> None:
