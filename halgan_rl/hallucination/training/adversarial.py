@@ -190,8 +190,8 @@ class AdversarialTrainer:
     ) -> dict[str, Tensor]:
         """Prefers real images to fakes, and to themselves under other configurations."""
         config, critic = self.config, self.critic
-        seen = [part.chunk(2) for part in critic.look(torch.cat([real, fake]), coarse=coarse)]
-        real_seen, fake_seen = zip(*seen, strict=True)
+        seen = critic.look(torch.cat([real, fake]), coarse=coarse)
+        real_seen, fake_seen = ({name: part.chunk(2)[half] for name, part in seen.items()} for half in (0, 1))
         score = critic.score(real_seen, features)
         gap = score - critic.score(fake_seen, features)
         wrong_gap = score - critic.score(real_seen, wrong)

@@ -1,6 +1,6 @@
 """A critic that sees the pose: whether an image is real, *and* shows the goal where the configuration says."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 import torch
@@ -13,8 +13,8 @@ LEAK = 0.2
 """Slope of its leaky rectifiers."""
 SHARPNESS = 5.0
 """Factor on the slopes of the half-planes from which maps are painted."""
-DEPTH = 3
-"""Convolutions, each of which halves the image."""
+CONVOLUTIONS = ("first", "second", "third")
+"""Each halves the image."""
 
 
 class PoseCritic(nn.Module):
@@ -28,8 +28,8 @@ class PoseCritic(nn.Module):
     - the inner product of the first convolutions' maps with maps that are painted from the configuration, see
       :class:`PaintedMaps`. They say *where* in the image the goal must be seen.
 
-    A coarse image, half as high and as wide, passes the same layers. Whole images reach them averaged, with a few
-    maps of a convolution of their own beside: at first these have no weight, so that training goes on where it was.
+    A coarse image, half as high and as wide, passes the same layers. Whole images reach them averaged, with the maps
+    of a convolution of their own beside: at first these have no weight, so that training goes on where it was.
 
     Args:
         feature_size: K, entries of the configuration's features.
@@ -54,29 +54,35 @@ class PoseCritic(nn.Module):
         painted_maps: bool = True,
     ) -> None:
         *size, channels = image_shape
-        smallest = 2 ** (DEPTH + 1)
+        smallest = 2 ** (len(CONVOLUTIONS) + 1)
         if min(size) < smallest:
             raise ValueError(
-                f"image_shape={tuple(image_shape)} is too small for the critic, which halves images {DEPTH + 1} times: "
-                f"height and width must be at least {smallest} pixels."
+                f"image_shape={tuple(image_shape)} is too small for the critic, which halves images four times: height "
+                f"and width must be at least {smallest} pixels."
             )
         super().__init__()
-        widths = [width * 2**layer for layer in range(DEPTH)]
+        widths = [width * 2**number for number in range(len(CONVOLUTIONS))]
         self.fine = nn.Conv2d(channels, fine_width, 4, stride=2, padding=1)
         self.from_fine = nn.Conv2d(fine_width, widths[0], 4, stride=2, padding=1, bias=False)
         nn.init.zeros_(self.from_fine.weight)
-        self.convolutions = nn.ModuleList(
-            nn.Conv2d(inputs, outputs, 4, stride=2, padding=1) for inputs, outputs in pairwise([channels, *widths])
+        self.convolutions = nn.ModuleDict(
+            {
+                name: nn.Conv2d(inputs, outputs, 4, stride=2, padding=1)
+                for name, (inputs, outputs) in zip(CONVOLUTIONS, pairwise([channels, *widths]), strict=True)
+            }
         )
-        self.maps = nn.ModuleList(PaintedMaps(feature_size, width) for width in widths[:-1] if painted_maps)
+        compared = {"fine": fine_width, "first": widths[0], "second": widths[1]} if painted_maps else {}
+        self.maps = nn.ModuleDict(
+            {name: PaintedMaps(feature_size, width, silent=name == "fine") for name, width in compared.items()}
+        )
         rows, columns = (length // smallest for length in size)
         self.summary = nn.Linear(widths[-1] * rows * columns, 128)
         self.realism = nn.Linear(128, 1)
         self.embedding = nn.Sequential(nn.Linear(feature_size, 64), nn.LeakyReLU(LEAK), nn.Linear(64, 128))
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
-    def look(self, images: Tensor, *, coarse: bool) -> list[Tensor]:
-        """Returns what the score is made of: maps of the image, and a summary.
+    def look(self, images: Tensor, *, coarse: bool) -> dict[str, Tensor]:
+        """Returns what the score is made of: maps of the image by their names, and its ``summary``.
 
         Args:
             images: float ``[N, C, H, W]`` in [-1, 1], of half the height and width if ``coarse``.
@@ -84,28 +90,31 @@ class PoseCritic(nn.Module):
         Keyword Args:
             coarse: whether the images are coarse.
         """
-        seen = []
-        fine = None if coarse else functional.leaky_relu(self.fine(images), LEAK)  # [N, F, H/2, W/2]
+        seen: dict[str, Tensor] = {}
         hidden = images if coarse else functional.avg_pool2d(images, 2)
-        for number, convolution in enumerate(self.convolutions):
+        if not coarse:
+            seen["fine"] = functional.leaky_relu(self.fine(images), LEAK)  # [N, F, H/2, W/2]
+        for name, convolution in self.convolutions.items():
             hidden = convolution(hidden)
-            if number == 0 and fine is not None:
-                hidden = hidden + self.from_fine(fine)
-            hidden = functional.leaky_relu(hidden, LEAK)
-            seen.append(hidden)
-        return [*seen[:-1], functional.leaky_relu(self.summary(seen[-1].flatten(1)), LEAK)]
+            if name == "first" and not coarse:
+                hidden = hidden + self.from_fine(seen["fine"])
+            seen[name] = hidden = functional.leaky_relu(hidden, LEAK)
+        return seen | {"summary": functional.leaky_relu(self.summary(hidden.flatten(1)), LEAK)}
 
-    def score(self, seen: Sequence[Tensor], features: Tensor) -> Tensor:
+    def score(self, seen: Mapping[str, Tensor], features: Tensor) -> Tensor:
         """Scores what was seen of images under configurations: ``[N]``.
 
         Args:
             seen: of N images, see :meth:`look`.
             features: of N configurations, ``[N, K]``.
         """
-        *maps, summary = seen
+        summary = seen["summary"]
         score = self.realism(summary).squeeze(-1)
         score = score + (summary * self.embedding(features)).sum(-1) / summary.shape[-1] ** 0.5
-        for painted, found in zip(self.maps, maps, strict=False):  # none, without painted maps
+        for name, painted in self.maps.items():
+            if name not in seen:  # coarse images have no fine maps
+                continue
+            found = seen[name]
             wanted = painted(features, *found.shape[2:])
             score = score + (found * wanted).sum((1, 2, 3)) / found[0].numel() ** 0.5
         return score
@@ -118,9 +127,10 @@ class PaintedMaps(nn.Module):
         feature_size: K.
         width: how many maps.
         hidden: half-planes, and channels of the pixel-wise layer.
+        silent: whether the maps are 0 until training changes them.
     """
 
-    def __init__(self, feature_size: int, width: int, *, hidden: int = 32) -> None:
+    def __init__(self, feature_size: int, width: int, *, hidden: int = 32, silent: bool = False) -> None:
         super().__init__()
         self.hidden = hidden
         last = nn.Linear(64, 3 * hidden)
@@ -131,9 +141,13 @@ class PaintedMaps(nn.Module):
             nn.LeakyReLU(LEAK),
             last,
         )
-        self.paint = nn.Sequential(nn.Linear(hidden, hidden), nn.LeakyReLU(LEAK), nn.Linear(hidden, width))
+        maps = nn.Linear(hidden, width)
+        self.paint = nn.Sequential(nn.Linear(hidden, hidden), nn.LeakyReLU(LEAK), maps)
         with torch.no_grad():
             last.bias[: 2 * hidden].normal_(0, 1.5)  # half-planes of all directions
+            if silent:
+                maps.weight.zero_()
+                maps.bias.zero_()
 
     def forward(self, features: Tensor, height: int, width: int) -> Tensor:
         """Returns the maps for features ``[N, K]`` at a resolution."""
