@@ -31,10 +31,13 @@ bench: $(BENCH_VENV)/ready  ## speed and memory side by side with the peers, in 
 	for benchmark in env_speed replay updates update_cost frame_time overlap; do \
 	  $(BENCH_VENV)/bin/python -m benchmarks.$$benchmark || exit 1; done
 
-weights: $(VENV)/ready  ## train the shipped generators again (a few minutes)
-	for environment in navigate-2m navigate-4m pick-and-place-2m pebble; do \
+weights: $(VENV)/ready  ## train the shipped generators again (an hour)
+	for pair in navigate-2m:default camouflage-2m:default navigate-4m:regression pick-and-place-2m:regression \
+	    pebble:pebble; do \
+	  environment=$${pair%:*} preset=$${pair#*:}; \
 	  run=runs/weights-$$environment shipped=halgan_rl/hallucination/shipped/$$environment; \
-	  $(BIN)/python recipes/train_generator.py --environment $$environment --seed 0 --out $$run && \
+	  OMP_NUM_THREADS=1 $(BIN)/python recipes/train_generator.py --preset $$preset --environment $$environment \
+	    --seed 0 --out $$run && \
 	  cp $$run/generator.safetensors $$shipped.safetensors && \
 	  cp $$run/generator.json $$shipped.json && \
 	  cp $$run/hallucinations.png $$shipped.png || exit 1; done

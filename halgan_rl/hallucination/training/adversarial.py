@@ -38,21 +38,21 @@ class AdversarialConfig:
         ValueError: if a value is out of range.
     """
 
-    steps: int = 6_000
+    steps: int = 4_000
     """Steps of adversarial training; 0 leaves it out."""
-    coarse: float = 0.6
+    coarse: float = 0.65
     """Fraction of the steps, the first ones, with images of half the height and width."""
     batch_size: int = 32
     """Real images of a step, and fake ones."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
     """Learning rate of both networks (Adam) with coarse images; it falls linearly in the second half."""
-    fine_learning_rate: float = 5e-4
+    fine_learning_rate: float = 1e-3
     """Learning rate with whole images; it falls likewise."""
     betas: tuple[float, float] = (0.0, 0.99)
     """Adam's decay rates."""
     penalty_weight: float = 0.3
     """Weight of the critic's squared slope at real images (R1) with coarse images."""
-    fine_penalty_weight: float = 3.0
+    fine_penalty_weight: float = 1.0
     """Weight of it with whole images, by which the critic overfits sooner."""
     penalty_interval: int = 8
     """Steps from one penalty to the next; its weight grows as much (StyleGAN2's trick)."""
