@@ -4,9 +4,9 @@ Usage::
 
     python -m benchmarks.few_snapshots --out results/few-snapshots   # half an hour on one core
 
-For each size of R a generator is trained (``recipes/train_generator.py --preset regression``), compared with the simulator's truth
-(``recipes/evaluate_generator.py``), and used by an agent in the 2 m room (``recipes/ddpg_navigate.py``). Into the
-folder go pictures, the agents' curves and one table.
+For each size of R a generator is trained (``recipes/train_generator.py --preset regression``), compared with the
+simulator's truth (``recipes/evaluate_generator.py``), and used by an agent in the 2 m room
+(``recipes/ddpg_navigate.py``). Into the folder go pictures, the agents' curves and one table.
 """
 
 import dataclasses
