@@ -42,6 +42,8 @@ VARIANTS: dict[str, tuple[str, Changes]] = {
     "... no wrong poses": adversarial(wrong_pose_weight=0.0),
     "... no painted maps": adversarial(painted_maps=False),
     "... no penalty": adversarial(penalty_weight=0.0, fine_penalty_weight=0.0),
+    "... no weight on the extent": adversarial(extent_weight=0.0),
+    "... no configurations elsewhere": adversarial(elsewhere=0),
     "... whole images from the start": adversarial(coarse=0.0),
     "... no moving average": adversarial(average_decay=0.0),
     "... not mirrored": ("default", {"training.mirror": False}),

@@ -28,6 +28,7 @@ evaluation:
 ``adversarial/critic_gap``          by how much real images score better than fakes; it grows where the critic overfits
 ``adversarial/wrong_pose_gap``      by how much real images score better than under another configuration
 ``adversarial/slope``               mean squared slope of the critic at real images
+``adversarial/extent``              how much of the images the generator changes
 ``paper/critic_distance``           estimate of the Wasserstein distance
 ``paper/auxiliary_real``            mean square error of the regressed configuration; ``.../auxiliary_fake``
 ``paper/change``                    mean square of H

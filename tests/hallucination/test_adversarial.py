@@ -151,6 +151,40 @@ def test_fakes_show_the_goal_that_is_pursued_in_their_failed_frame() -> None:
     assert torch.equal(features[:, 4] > 0, red_below)
 
 
+@pytest.mark.parametrize("kind", [CoordinateGenerator, PaperGenerator])
+def test_a_change_of_nothing_has_no_extent_and_a_weight_on_it_makes_changes_smaller(
+    kind: type[HallucinationGenerator],
+) -> None:
+    generator = kind()
+    shape = generator(torch.zeros(2, generator.encoding.size), torch.zeros(2, generator.latent_size)).shape
+    nothing, something = torch.zeros(shape), torch.full(shape, 0.5)
+    assert generator.extent(nothing).tolist() == [0, 0]
+    assert generator.extent(something).tolist() == [0.5, 0.5]
+    extents = []
+    for weight in (0.0, 1000.0):
+        trainer = make_trainer(AdversarialConfig(steps=20, coarse=1.0, batch_size=4, extent_weight=weight), kind=kind)
+        extents.append([float(trainer.step()["extent"]) for _ in range(20)])
+    assert extents[1][-1] < 0.8 * extents[0][-1]
+
+
+def test_what_is_painted_behind_shrinks_although_no_near_goal_frame_has_goals_there() -> None:
+    """All goals of the data lie ahead. A generator that paints all over is to stop that behind."""
+    behind = torch.tensor([[-1.0, 0.0, 0.0], [-0.5, 0.5, 1.0]])
+    extents = {}
+    for elsewhere in (0, 8):
+        config = AdversarialConfig(steps=40, coarse=1.0, batch_size=4, extent_weight=100.0, elsewhere=elsewhere)
+        trainer = make_trainer(config)
+        with torch.no_grad():
+            list(trainer.generator.paint)[-1].bias[3:] = 0.0
+        for _ in range(40):
+            trainer.step()
+        features = trainer.generator.encoding(behind)
+        with torch.no_grad():
+            change = trainer.generator(features, torch.zeros(2, trainer.generator.latent_size))
+        extents[elsewhere] = float(trainer.generator.extent(change).mean())
+    assert extents[8] < 0.9 * extents[0]
+
+
 def test_the_slope_is_penalised_at_its_interval() -> None:
     trainer = make_trainer()
     assert [bool(trainer.step()["slope"].isfinite()) for _ in range(4)] == [True, False, True, False]
@@ -200,6 +234,8 @@ def test_a_trainer_goes_on_from_its_state_bit_for_bit_and_needs_all_of_it(broken
         {"coarse": 1.5},
         {"backgrounds": -1},
         {"learning_rate": 0.0},
+        {"extent_weight": -0.1},
+        {"elsewhere": -1},
         {"average_decay": -0.1},
     ],
 )

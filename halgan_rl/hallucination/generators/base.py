@@ -88,6 +88,10 @@ class HallucinationGenerator(nn.Module, ABC):
         """Draws latents ``[count, Z]`` from their prior."""
 
     @abstractmethod
+    def extent(self, change: Tensor) -> Tensor:
+        """Returns how much a change alters images, float ``[N]``: 0 if it leaves them as they are."""
+
+    @abstractmethod
     def compose(self, images: Tensor, change: Tensor) -> Tensor:
         """Returns images float ``[N, C, H, W]`` in [-1, 1] with a change applied; same shape and range."""
 

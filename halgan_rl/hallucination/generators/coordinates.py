@@ -107,6 +107,10 @@ class CoordinateGenerator(HallucinationGenerator):
         """Draws latents ``[count, Z]`` from N(0, 1)."""
         return torch.randn(count, self.latent_size, generator=rng)
 
+    def extent(self, change: Tensor) -> Tensor:
+        """Returns the fraction of each image that a matte covers, ``[N]``."""
+        return change[:, self._parts[0] :].mean((1, 2, 3))
+
     def compose(self, images: Tensor, change: Tensor) -> Tensor:
         """Returns images ``[N, C, H, W]`` under mattes; exactly the images where the opacity is 0."""
         colour, opacity = change.split(self._parts, 1)

@@ -71,6 +71,10 @@ class PaperGenerator(HallucinationGenerator):
         """Draws latents ``[count, Z]`` from N(1, 0.1)."""
         return 1 + 0.1 * torch.randn(count, self.latent_size, generator=rng)
 
+    def extent(self, change: Tensor) -> Tensor:
+        """Returns the mean absolute H of each image, ``[N]``."""
+        return change.abs().mean((1, 2, 3))
+
     def compose(self, images: Tensor, change: Tensor) -> Tensor:
         """Returns images with H added, see ``composition``."""
         if self.composition == "dimming":

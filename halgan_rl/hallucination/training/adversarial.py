@@ -14,6 +14,7 @@ Four things make it work, see ``results/generators.md``:
 Training starts with coarse images, half as high and as wide. No colours are looked at, and no goal is masked.
 """
 
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
@@ -60,6 +61,12 @@ class AdversarialConfig:
     """Weight of telling real images under their configuration from the same under another's."""
     painted_maps: bool = True
     """Show the critic where in the image the goal must be seen, instead of comparing summaries alone."""
+    extent_weight: float = 0.2
+    """Weight of how much of the image the generator changes: a goal that resembles the room would be painted where
+    nothing needs to change."""
+    elsewhere: int = 8
+    """Configurations of a step between any two failed poses; only the weight on the extent applies to them. Near-goal
+    frames show no goal that lies behind, and what is painted there is otherwise up to chance."""
     label_noise: tuple[float, float] = (0.01, 0.02)
     """Standard deviation of the noise on configurations: lengths [m], angles [rad]."""
     backgrounds: int = 4
@@ -69,7 +76,13 @@ class AdversarialConfig:
 
     def __post_init__(self) -> None:
         """Refuses values that make no sense."""
-        for name, least in (("steps", 0), ("batch_size", 2), ("penalty_interval", 1), ("backgrounds", 0)):
+        for name, least in (
+            ("steps", 0),
+            ("batch_size", 2),
+            ("penalty_interval", 1),
+            ("backgrounds", 0),
+            ("elsewhere", 0),
+        ):
             if getattr(self, name) < least:
                 raise ValueError(f"{name}={getattr(self, name)} must be at least {least}.")
         for name in ("coarse", "average_decay"):
@@ -78,6 +91,9 @@ class AdversarialConfig:
         for name in ("learning_rate", "fine_learning_rate"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}={getattr(self, name)} must be positive.")
+        for name in ("penalty_weight", "fine_penalty_weight", "wrong_pose_weight", "extent_weight"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name}={getattr(self, name)} must not be negative.")
 
     @property
     def coarse_steps(self) -> int:
@@ -135,6 +151,7 @@ class AdversarialTrainer:
         self.steps = 0
         self._encoding, self._mirror = generator.encoding, mirror
         self._real_pixels, self._failed_pixels = near_goal["pixels"], failed["pixels"]
+        self._failed_pose = failed["pose"]
         self._labels = generator.encoding.labels(near_goal["pose"], near_goal["goal_pose"])
         self._noise = generator.encoding.noise(*config.label_noise)
         count = config.backgrounds or len(failed["pose"])
@@ -150,15 +167,17 @@ class AdversarialTrainer:
         Returns:
             Scalars: ``critic_gap``, by how much real images score better than fakes; ``wrong_pose_gap``, by how much
             better than themselves under another configuration; ``slope``, the critic's mean squared slope at real
-            images, NaN where it is not penalised.
+            images, NaN where it is not penalised; ``extent``, how much of the images the generator changes.
         """
         coarse = self.steps < self.config.coarse_steps
         for optimizer in self._optimizers.values():
             optimizer.param_groups[0]["lr"] = self.config.rate_at(self.steps)
         real, background, features, wrong = self._draw(coarse=coarse)
-        fake = self._paint(background, features, coarse=coarse)
+        change = self._draw_change(features, size=real.shape[2:])
+        fake = self.generator.compose(background, change)
         metrics = self._train_critic(real, fake.detach(), features, wrong, coarse=coarse)
-        self._train_generator(real, fake, features, coarse=coarse)
+        extent = self.generator.extent(change).mean() + self._extent_elsewhere(size=real.shape[2:])
+        metrics |= self._train_generator(real, fake, features, extent, coarse=coarse)
         self.steps += 1
         self._update_average()
         return metrics
@@ -215,15 +234,18 @@ class AdversarialTrainer:
         (slope,) = torch.autograd.grad(score.sum(), images, create_graph=True)
         return slope.square().sum((1, 2, 3)).mean()
 
-    def _train_generator(self, real: Tensor, fake: Tensor, features: Tensor, *, coarse: bool) -> None:
-        """Makes fakes that the critic prefers to real images."""
+    def _train_generator(
+        self, real: Tensor, fake: Tensor, features: Tensor, extent: Tensor, *, coarse: bool
+    ) -> dict[str, Tensor]:
+        """Makes fakes that the critic prefers to real images, and that change little."""
         critic = self.critic
         with torch.no_grad():
             score = critic.score(critic.look(real, coarse=coarse), features)
         critic.requires_grad_(False)
         gap = score - critic.score(critic.look(fake, coarse=coarse), features)
         critic.requires_grad_(True)
-        self._descend("generator", functional.softplus(gap).mean())
+        self._descend("generator", functional.softplus(gap).mean() + self.config.extent_weight * extent)
+        return {"extent": extent.detach()}
 
     def _descend(self, name: str, loss: Tensor) -> None:
         self._optimizers[name].zero_grad()
@@ -252,10 +274,18 @@ class AdversarialTrainer:
         real, background = (_prepare(pixels, flip, coarse=coarse) for pixels in images)
         return real, background, self._encoding(labels), self._encoding(wrong)
 
-    def _paint(self, background: Tensor, features: Tensor, *, coarse: bool) -> Tensor:
-        """Returns the background with goals painted in, in its own resolution."""
-        latent = self.generator.sample_latent(len(features), self.rng)
-        return self.generator.compose(background, self.generator(features, latent, size=background.shape[2:]))
+    def _extent_elsewhere(self, *, size: Sequence[int]) -> Tensor:
+        """Returns how much is changed where goals lie anywhere, also where no near-goal frame has them."""
+        count = self.config.elsewhere
+        if not count:
+            return torch.zeros(())
+        here, there = torch.randint(len(self._failed_pose), (2, count), generator=self.rng)
+        labels = self._encoding.labels(self._failed_pose[here], self._failed_pose[there])
+        return self.generator.extent(self._draw_change(self._encoding(labels), size=size)).mean()
+
+    def _draw_change(self, features: Tensor, *, size: Sequence[int]) -> Tensor:
+        """Returns the generator's changes of images of a size, each with a latent of its own."""
+        return self.generator(features, self.generator.sample_latent(len(features), self.rng), size=size)
 
 
 def _prepare(pixels: Tensor, flip: Tensor, *, coarse: bool) -> Tensor:

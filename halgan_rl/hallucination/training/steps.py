@@ -20,6 +20,7 @@ LOSSES = (
     "adversarial/critic_gap",
     "adversarial/wrong_pose_gap",
     "adversarial/slope",
+    "adversarial/extent",
     "paper/critic_distance",
     "paper/auxiliary_real",
     "paper/auxiliary_fake",
