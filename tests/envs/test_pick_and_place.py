@@ -390,7 +390,11 @@ def test_each_stage_shows_its_goal_where_the_goal_pose_says(near_goal, renderer)
 
 def test_failed_snapshots_come_from_both_stages_and_show_the_carried_box(environment):
     failed = collect_failed(environment, 60, np.random.RandomState(0))
-    assert {key: value.shape for key, value in failed.items()} == {"pixels": (60, 64, 64, 3), "pose": (60, 4)}
+    assert {key: value.shape for key, value in failed.items()} == {
+        "pixels": (60, 64, 64, 3),
+        "pose": (60, 4),
+        "episode": (60,),
+    }
     assert failed["pose"][:, 3].tolist() == [0.0] * 30 + [1.0] * 30
     assert all(red(image)[-4:, 12:52].all() for image in failed["pixels"][30:])
 

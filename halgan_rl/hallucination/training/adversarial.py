@@ -61,7 +61,7 @@ class AdversarialConfig:
     """Weight of telling real images under their configuration from the same under another's."""
     painted_maps: bool = True
     """Show the critic where in the image the goal must be seen, instead of comparing summaries alone."""
-    extent_weight: float = 0.2
+    extent_weight: float = 3.0
     """Weight of how much of the image the generator changes: a goal that resembles the room would be painted where
     nothing needs to change."""
     elsewhere: int = 8
