@@ -32,7 +32,7 @@ bench: $(BENCH_VENV)/ready  ## speed and memory side by side with the peers, in 
 	  $(BENCH_VENV)/bin/python -m benchmarks.$$benchmark || exit 1; done
 
 weights: $(VENV)/ready  ## train the shipped generators again (ten minutes)
-	for pair in navigate-2m:regression navigate-4m:regression pick-and-place-2m:regression pebble:pebble; do \
+	for pair in navigate-2m:default navigate-4m:default pick-and-place-2m:default pebble:pebble; do \
 	  environment=$${pair%:*} preset=$${pair#*:}; \
 	  run=runs/weights-$$environment shipped=halgan_rl/hallucination/shipped/$$environment; \
 	  OMP_NUM_THREADS=1 $(BIN)/python recipes/train_generator.py --preset $$preset --environment $$environment \

@@ -4,7 +4,7 @@ Usage::
 
     python -m benchmarks.few_snapshots --out results/few-snapshots   # half an hour on one core
 
-For each size of R a generator is trained (``recipes/train_generator.py --preset regression``), compared with the
+For each size of R a generator is trained (``recipes/train_generator.py``), compared with the
 simulator's truth (``recipes/evaluate_generator.py``), and used by an agent in the 2 m room
 (``recipes/ddpg_navigate.py``). Into the folder go pictures, the agents' curves and one table.
 """
@@ -62,7 +62,7 @@ def judge(size: int, study: Study) -> list[str]:
     with TemporaryDirectory() as temporary:
         generator, judged, agent = (Path(temporary, name) for name in ("generator", "judged", "agent"))
         changes = {"data.near_goal_frames": size, "seed": study.seed, "out": generator}
-        train_generator.main(changed(train_generator.PRESETS["regression"], changes))
+        train_generator.main(changed(train_generator.PRESETS["default"], changes))
         weights = generator / "generator.safetensors"
         evaluate_generator.main(evaluate_generator.Config(weights=weights, out=judged))
         changes = {  # of the agent

@@ -4,7 +4,7 @@ Usage::
 
     python -m benchmarks.halgan_ablation --out results/ablation   # four hours on one core
 
-Trains a generator with ``recipes/train_generator.py`` for each variant: by the default's adversarial training, by the
+Trains a generator with ``recipes/train_generator.py`` for each variant: by adversarial training, by the
 same with one part left out, by matte regression, and by the paper's loop for some minutes. At intervals each is
 compared with the simulator's truth on the same held-out poses. Into the folder go the runs' curves, one picture and one
 table: fidelity in the end, steps and minutes, and when the variant reached the best that the paper's loop got to. A
@@ -31,13 +31,13 @@ Changes = dict[str, Any]
 
 
 def adversarial(**changes: Any) -> tuple[str, Changes]:
-    """Return the default's adversarial training with some values changed."""
-    return "default", {f"training.adversarial.{name}": value for name, value in changes.items()}
+    """Return adversarial training with some values changed."""
+    return "adversarial", {f"training.adversarial.{name}": value for name, value in changes.items()}
 
 
 PAPER, REGRESSION = "the paper's loop", "matte regression"
 VARIANTS: dict[str, tuple[str, Changes]] = {
-    "adversarial": ("default", {}),
+    "adversarial": ("adversarial", {}),
     "... backgrounds not matched": adversarial(backgrounds=0),
     "... no wrong poses": adversarial(wrong_pose_weight=0.0),
     "... no painted maps": adversarial(painted_maps=False),
@@ -46,11 +46,11 @@ VARIANTS: dict[str, tuple[str, Changes]] = {
     "... no configurations elsewhere": adversarial(elsewhere=0),
     "... whole images from the start": adversarial(coarse=0.0),
     "... no moving average": adversarial(average_decay=0.0),
-    "... not mirrored": ("default", {"training.mirror": False}),
-    "... distance and bearing": ("default", {"generator.configuration": "polar"}),
-    "... the paper's generator": ("default", {"generator.kind": "paper"}),
-    REGRESSION: ("regression", {}),
-    "matte regression, then adversarial": ("default", {"training.mattes.steps": 2_500}),
+    "... not mirrored": ("adversarial", {"training.mirror": False}),
+    "... distance and bearing": ("adversarial", {"generator.configuration": "polar"}),
+    "... the paper's generator": ("adversarial", {"generator.kind": "paper"}),
+    REGRESSION: ("default", {}),
+    "matte regression, then adversarial": ("adversarial", {"training.mattes.steps": 2_500}),
     PAPER: ("paper", {"evaluate_every": 5}),
 }
 """Name: preset of ``train_generator``, and what is changed of it, by the names of its flags."""

@@ -25,7 +25,7 @@ def test_variants_differ_from_each_other_and_leave_the_paper_alone() -> None:
 def test_the_table_has_a_line_for_each_variant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tiny = {f"data.{name}": 40 for name in ("near_goal_frames", "failed_frames")}
     tiny |= {"data.held_out_frames": 4, "evaluate_every": 1}
-    monkeypatch.setattr(halgan_ablation, "VARIANTS", {REGRESSION: ("regression", tiny), PAPER: ("paper", tiny)})
+    monkeypatch.setattr(halgan_ablation, "VARIANTS", {REGRESSION: ("default", tiny), PAPER: ("paper", tiny)})
     ablation = Ablation(out=tmp_path / "table", minutes=1e-6, paper_minutes=1e-6, only=(REGRESSION, PAPER))
     halgan_ablation.main(ablation)
     table = json.loads((tmp_path / "table" / "ablation.json").read_text())["tables"][0]

@@ -54,9 +54,9 @@ class GeneratorTrainingConfig:
         ValueError: if no stage has steps.
     """
 
-    mattes: MatteConfig = field(default_factory=partial(MatteConfig, steps=0))
+    mattes: MatteConfig = field(default_factory=MatteConfig)
     """Matte regression, for a generator by coordinates and a goal of its own colour."""
-    adversarial: AdversarialConfig = field(default_factory=AdversarialConfig)
+    adversarial: AdversarialConfig = field(default_factory=partial(AdversarialConfig, steps=0))
     """Adversarial training."""
     paper: PaperTrainingConfig = field(default_factory=partial(PaperTrainingConfig, steps=0))
     """The paper's adversarial training."""
