@@ -96,6 +96,7 @@ def test_evaluation_in_the_background_changes_nothing(halgan_run: Path, tmp_path
     assert len(set(at_once["eval/return"])) == 2  # the two policies that were handed over can be told apart
 
 
+@pytest.mark.slow  # tests/training/test_background_collector.py has the quick one
 def test_collection_in_the_background_repeats_itself_a_batch_behind(halgan_run: Path, tmp_path: Path) -> None:
     one, other = (run(tmp_path / name, {"training.background_collection": True}) for name in ("one", "other"))
     assert differ(one, other) == set()

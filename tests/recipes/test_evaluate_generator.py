@@ -25,6 +25,7 @@ def test_the_shipped_weights_are_near_the_truth(bank: bool, tmp_path: Path, caps
     assert "mask overlap" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_goals_that_never_stay_in_view_have_no_scatter_and_all_else(tmp_path: Path) -> None:
     main(dataclasses.replace(TINY, environment="pebble", out=tmp_path / "report"))
     report = json.loads((tmp_path / "report" / "fidelity.json").read_text())
