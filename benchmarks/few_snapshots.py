@@ -61,11 +61,11 @@ def judge(size: int, study: Study) -> list[str]:
     """Returns the table's line for one size of R."""
     with TemporaryDirectory() as temporary:
         generator, judged, agent = (Path(temporary, name) for name in ("generator", "judged", "agent"))
-        changes = {"data.near_goal_frames": size, "seed": study.seed, "out": generator}
-        train_generator.main(changed(train_generator.PRESETS["default"], changes))
+        of_generator = {"data.near_goal_frames": size, "seed": study.seed, "out": generator}
+        train_generator.main(changed(train_generator.PRESETS["default"], of_generator))
         weights = generator / "generator.safetensors"
         evaluate_generator.main(evaluate_generator.Config(weights=weights, out=judged))
-        changes = {  # of the agent
+        changes = {
             "painter.weights": weights,
             "total_frames": study.total_frames,
             "seed": study.seed,

@@ -155,8 +155,11 @@ def run(
     return metrics
 
 
-def prepare(config: GeneratorRunConfig) -> None:
-    """Refuses a folder that cannot be used; the first line of a recipe.
+def prepare(config: GeneratorRunConfig) -> dict[str, Any] | None:
+    """Refuses a folder that cannot be used, before any work is done; the first line of a recipe.
+
+    Returns:
+        The state of the run to resume, or None for a new run.
 
     Raises:
         FileExistsError: if the folder of the run already holds anything, unless it is resumed.
@@ -165,8 +168,8 @@ def prepare(config: GeneratorRunConfig) -> None:
     """
     if not config.resume:
         check_unused(config.out)
-        return
-    load_state(config.out / STATE)
+        return None
+    state = load_state(config.out / STATE)
     written = json.loads((config.out / "config.json").read_text())["config"]
     now = json.loads(as_json(dataclasses.asdict(config)))
     different = [name for name in now if name not in MAY_DIFFER and written.get(name) != now[name]]
@@ -174,6 +177,7 @@ def prepare(config: GeneratorRunConfig) -> None:
         raise ValueError(
             f"{config.out} cannot be resumed with other values of {', '.join(different)}: pass those of its config.json"
         )
+    return state
 
 
 def open_folder(config: GeneratorRunConfig) -> tuple[RunFolder, dict[str, Any] | None]:
@@ -181,12 +185,11 @@ def open_folder(config: GeneratorRunConfig) -> tuple[RunFolder, dict[str, Any] |
 
     Metrics of steps after the state's are dropped: they are made again.
     """
-    prepare(config)
-    if not config.resume:
+    state = prepare(config)
+    if state is None:
         folder = RunFolder(config.out, columns=COLUMNS)
         folder.write_config(dataclasses.asdict(config))
         return folder, None
-    state = load_state(config.out / STATE)
     steps = state["training"]["steps"]
     return RunFolder.reopen(config.out, columns=COLUMNS, keep=lambda row: float(row["steps"]) <= steps), state
 

@@ -187,7 +187,7 @@ def test_what_is_painted_behind_shrinks_although_no_near_goal_frame_has_goals_th
 
 def test_the_slope_is_penalised_at_its_interval() -> None:
     trainer = make_trainer()
-    assert [bool(trainer.step()["slope"].isfinite()) for _ in range(4)] == [True, False, True, False]
+    assert ["slope" in trainer.step() for _ in range(4)] == [True, False, True, False]
 
 
 def test_the_average_follows_closely_at_first_and_lags_later() -> None:

@@ -167,7 +167,7 @@ class AdversarialTrainer:
         Returns:
             Scalars: ``critic_gap``, by how much real images score better than fakes; ``wrong_pose_gap``, by how much
             better than themselves under another configuration; ``slope``, the critic's mean squared slope at real
-            images, NaN where it is not penalised; ``extent``, how much of the images the generator changes.
+            images, in steps that penalise it; ``extent``, how much of the images the generator changes.
         """
         coarse = self.steps < self.config.coarse_steps
         for optimizer in self._optimizers.values():
@@ -215,17 +215,14 @@ class AdversarialTrainer:
         gap = score - critic.score(fake_seen, features)
         wrong_gap = score - critic.score(real_seen, wrong)
         loss = functional.softplus(-gap).mean() + config.wrong_pose_weight * functional.softplus(-wrong_gap).mean()
-        slope = torch.full((), torch.nan)
+        metrics = {"critic_gap": gap.mean().detach(), "wrong_pose_gap": wrong_gap.mean().detach()}
         if self.steps % config.penalty_interval == 0:
             slope = self._slope(real, features, coarse=coarse)
             weight = config.penalty_weight if coarse else config.fine_penalty_weight
             loss = loss + config.penalty_interval * weight / 2 * slope
+            metrics["slope"] = slope.detach()
         self._descend("critic", loss)
-        return {
-            "critic_gap": gap.mean().detach(),
-            "wrong_pose_gap": wrong_gap.mean().detach(),
-            "slope": slope.detach(),
-        }
+        return metrics
 
     def _slope(self, real: Tensor, features: Tensor, *, coarse: bool) -> Tensor:
         """Returns the mean squared norm of the score's gradient in the images."""
